@@ -245,8 +245,9 @@ class Playback:
                 raise self._diverged(other, "frames without the time of their read")
             self.items.clear()  # the log was cut within it
             return
-        if core.process_frames(frames, item.read_ns) and (sample := core.setup.memory.newest) is not None:
-            self._step = core.setup.memory.step_of(sample)
+        core.process_frames(frames, item.read_ns)
+        if core.has_answer:
+            self._step = core.setup.memory.step
             self._due, self._came = (ANSWER, *OF_THE_BUS), f"the record of step {self._step}"
 
     def _call(self, core: Core, item: InputRecord) -> None:

@@ -257,16 +257,15 @@ def _guard(dice: random.Random) -> Iterator[Any]:
 
 def _states(dice: random.Random) -> Iterator[Any]:
     machine = state_machine
-    bench = _bench()
     events = (*machine.Event, *machine.Fault)
     while True:
         run, now_ns = machine.Run(), 10**9
         for _ in range(12):
             now_ns += dice.randrange(0, 5_000_000)
             event = dice.choice(events if dice.random() < 0.1 else tuple(machine.Event))
-            after = _tried(machine.step, bench, run, event, now_ns)
+            after = _tried(machine.step, run, event, now_ns)
             run = after if isinstance(after, machine.Run) else run
-            yield tuple(map(str, after)), machine.missed(bench, run, now_ns), machine.may_send(run.state)
+            yield tuple(map(str, after)), machine.may_enable(run.state), machine.may_send(run.state)
 
 
 def _bounds(dice: random.Random) -> Iterator[Any]:

@@ -3,7 +3,7 @@
 A driver does all that blocks (:mod:`emb_runtime.control.loop`; a rerun plays a log instead):
 
 * :meth:`Core.process_frames` gets the frames of one read, and decides on a command for the newest sample among them;
-* :meth:`Core.answer` gives the frame to send, checked by the guard, unless it is too late or not permitted;
+* :meth:`Core.answer` gives the frame to send, checked by the guard, if there is one and it may still be sent;
 * :meth:`Core.sent` records the cycle;
 * :meth:`Core.timeout` counts a period without a sample.
 
@@ -20,13 +20,14 @@ from collections.abc import Sequence
 from typing import Final
 
 from emb_runtime.can.receiver import BUS_OFF
-from emb_runtime.control.memory import Proposal, latest_answer_ns
+from emb_runtime.control.memory import latest_answer_ns
 from emb_runtime.control.monitors import check_bus
 from emb_runtime.control.phases import Phase, Silent, Stopping
 from emb_runtime.control.result import Outcome
 from emb_runtime.control.setup import Setup
 from emb_runtime.log.ring_buffer import FrameRecord, InputRecord, Record
-from emb_runtime.records import Call, Frame, Reason, RunState
+from emb_runtime.records import Call, Frame, Reason, RunState, SensorSample
+from emb_runtime.safety.command_limits import Decision
 from emb_runtime.safety.response_cause import cause
 from emb_runtime.safety.state_machine import Event, Fault, StopError
 
@@ -34,7 +35,6 @@ SILENT: Final = RunState.SILENT
 OVER: Final = RunState.OVER
 IN_CONTROL: Final = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)
 ENDING: Final = (RunState.STOPPING, OVER)
-PAIR: Final = Event.PAIR
 ANSWER: Final = int(Call.ANSWER)
 OF_RESPONSE: Final = (
     Fault.RESPONSE_LATE,
@@ -58,8 +58,7 @@ class Core:
         self._phase: Phase = Silent(setup)
         self._stopping: Stopping | None = None  # the last phase
         self._latest_answer_ns = latest_answer_ns(setup.bench)
-        self._proposal: Proposal | None = None  # to be answered
-        self._pending: Proposal | None = None  # its frame was given to the driver
+        self._decision: Decision | None = None  # on the newest sample, to be answered
         self._permitted = True
         self._detail = ""  # of the fault
         self._answer_at = 0  # place of the newest answer in the records
@@ -93,6 +92,11 @@ class Core:
         return rests and self._reception.stop_reason is not None
 
     @property
+    def has_answer(self) -> bool:
+        """Returns True if :meth:`answer` has a command for the newest sample."""
+        return self._decision is not None
+
+    @property
     def deadline_ns(self) -> int:
         """Time until which the next frames are waited for, monotonic [ns]."""
         return self._phase.deadline_ns
@@ -111,9 +115,9 @@ class Core:
         self._memory.read_ns = now_ns
         self._machine.handle_event(Event.PREPARED, now_ns)
 
-    def process_frames(self, frames: Sequence[Frame], now_ns: int) -> bool:
-        """Process the frames of one read at a monotonic time [ns]; returns True if :meth:`answer` comes next."""
-        memory, self._proposal = self._memory, None
+    def process_frames(self, frames: Sequence[Frame], now_ns: int) -> None:
+        """Process the frames of one read at a monotonic time [ns]; :meth:`answer` comes next."""
+        memory, self._decision = self._memory, None
         memory.read_ns = now_ns
         for left, frame in enumerate(frames, 1 - len(frames)):
             memory.records.append(tuple.__new__(FrameRecord, (frame, now_ns if left == 0 else 0)))
@@ -123,41 +127,38 @@ class Core:
             except StopError as stop:
                 self._fail(stop, now_ns)
         if not self.running:
-            return False
+            return
         try:
             check_bus(self.setup.layout, self._reception)
-            self._proposal = self._phase.propose()
-            if self._proposal is None:
+            self._decision = self._phase.decide()
+            if self._decision is None:
                 self._follow_state()
         except StopError as ended:
             self._fail(ended, now_ns)
-        return self._proposal is not None
 
     def answer(self, now_ns: int) -> Frame | None:
-        """Frame that answers the newest sample, decided at a monotonic time [ns]; None if it is left to the node.
+        """Frame that answers the newest sample, decided at a monotonic time [ns]; None: no command, or none may leave.
 
         If there is one, :meth:`sent` comes next, before the driver takes the records.
 
         Raises:
             GuardRejectedError: the frame is not in the guard's contract.
         """
-        proposal, self._proposal = self._proposal, None  # nothing is answered twice
-        if proposal is None:
+        memory, decision = self._memory, self._decision
+        sample, self._decision = memory.newest, None  # nothing is answered twice
+        if decision is None or sample is None:
             return None
-        records = self._memory.records
-        self._answer_at = len(records)
-        records.append(tuple.__new__(InputRecord, (now_ns, ANSWER, 0, "", "")))
-        sample, _, _, decision = proposal
+        self._answer_at = len(memory.records)
+        memory.records.append(tuple.__new__(InputRecord, (now_ns, ANSWER, 0, "", "")))
         in_time = now_ns - sample.receive_time_ns <= self._latest_answer_ns  # else the sample is stale
         if not in_time or not self._may_answer(now_ns) or math.isnan(decision.current):
             left = decision.reasons & Reason.LEFT if in_time else 0
-            self._memory.unanswered(sample, self._memory.missed, now_ns, left)
-            self._end_cycle(proposal)
+            memory.unanswered(sample, memory.missed, now_ns, left)
+            self._end_cycle(sample)
             return None
         write, counter = self.setup.layout.write_command, self.guard.next_counter
         frame, command = write(counter, sample.counter, decision.current, True)
-        self._memory.decided(command, now_ns)
-        self._pending = proposal
+        memory.decided(decision, command)
         return self.guard.check(frame, self.state, sample.receive_time_ns, now_ns)
 
     def sent(self, now_ns: int, lost: str = "") -> None:
@@ -167,17 +168,17 @@ class Core:
         answer an old sample.
         """
         memory, at = self._memory, self._answer_at
-        proposal, self._pending = self._pending, None
-        assert proposal is not None
+        sample = memory.newest
+        assert sample is not None
         decide_ns = memory.records[at].time_ns
         memory.records[at] = tuple.__new__(InputRecord, (decide_ns, ANSWER, 0 if lost else now_ns, "", lost))
         if lost:
             memory.counters.not_taken += 1
             self._machine.note(Fault.SEND_QUEUE_FULL, lost, now_ns)
-            memory.unanswered(proposal.sample, memory.missed, now_ns)
+            memory.unanswered(sample, memory.missed, now_ns)
         else:
-            memory.answered(proposal, now_ns)
-        self._end_cycle(proposal)
+            memory.answered(decide_ns, now_ns)
+        self._end_cycle(sample)
 
     def timeout(self, now_ns: int) -> None:
         """Count that no frame came until :attr:`deadline_ns`."""
@@ -272,7 +273,6 @@ class Core:
         if reception.dropped > dropped:
             self._machine.note(Fault.FRAMES_DROPPED, f"{reception.dropped} so far", frame.time_ns)
         if sample is not None:
-            self._machine.handle_event(PAIR, sample.receive_time_ns)
             self._phase = self._phase.process_sample(sample)
 
     def _count_error(self, frame: Frame) -> None:
@@ -293,9 +293,9 @@ class Core:
         self._permitted = not why
         return not why
 
-    def _end_cycle(self, proposal: Proposal) -> None:
+    def _end_cycle(self, sample: SensorSample) -> None:
         """Record the estimate and update the motion balance, after the command was sent."""
-        self.setup.estimate.record(proposal.sample, proposal.step, self._memory)
+        self.setup.estimate.record(sample, self._memory)
         try:
             self.setup.sensors.update_balance()
         except StopError as stop:

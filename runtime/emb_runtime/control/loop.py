@@ -6,7 +6,7 @@ stop frames leave, each is tried, and nothing that is called can keep them back.
 where the watchdog sends them. Any other BaseException than an Exception or SystemExit is raised after the stop.
 
 One driver serves a real bus and a simulated one in lock-step: clock and reception are handed in. The clock is read once
-per event: frames or a timeout are in hand, the command is decided, the command is sent.
+per event: frames or a timeout are in hand, a decision is made, a command is sent.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from emb_runtime.log.ring_buffer import Record
 from emb_runtime.records import Frame, RunState
 from emb_runtime.safety.guard import GuardRejectedError
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Heartbeat, Unwatched
-from emb_runtime.safety.state_machine import Fault, StopError
+from emb_runtime.safety.state_machine import Fault, StopError, may_enable
 from emb_runtime.system.terminal import one_line
 
 STOP_LISTEN_NS: Final = 1_500_000_000
@@ -86,10 +86,10 @@ class Loop:
             core.explain(fault, self._now_ns)
         if not frames:
             core.timeout(self._now_ns)
-        elif core.process_frames(frames, self._now_ns):
-            self._answer()
-        elif len(core.records) < HELD_RECORDS:
-            return
+        else:
+            core.process_frames(frames, self._now_ns)
+            if not self._answer() and len(core.records) < HELD_RECORDS:
+                return
         self._push_records()
 
     def _read(self, deadline_ns: int) -> list[Frame]:
@@ -117,21 +117,23 @@ class Loop:
                 return Fault.WATCHDOG_LOST
         return None
 
-    def _answer(self) -> None:
-        """Write the frame that answers the newest sample, unless it is left to the node."""
-        if not self._watched:
+    def _answer(self) -> bool:
+        """Write the frame that answers the newest sample; returns False if there is none."""
+        core = self.core
+        if not self._watched and may_enable(core.state):
             self.pulse.arm(self._now_ns)
             self._watched = True
-        core, decide_ns = self.core, self._read_clock()
+        decide_ns = self._read_clock()
         frame = core.answer(decide_ns)
         if frame is None:
-            return
+            return False
         try:
             core.guard.send(frame)
         except TransmitQueueFullError as err:
             core.sent(decide_ns, lost=str(err))
         else:
             core.sent(self._read_clock())
+        return True
 
     def _push_records(self) -> None:
         """Record what has happened."""

@@ -1,7 +1,6 @@
 """Memory of a run by sampling periods: newest sample, missed periods, sent commands, and the record of each cycle.
 
-Here periods are counted by device time, between two samples. By arrival time
-:func:`emb_runtime.safety.state_machine.missed` counts them, at the deadlines after the last sample.
+Missed periods are counted by device time, between two samples; until the next sample comes, by the deadlines that pass.
 """
 
 from __future__ import annotations
@@ -21,15 +20,6 @@ from emb_runtime.safety.shield import NO_PAST
 MISSED: Final = int(Reason.MISSED)
 NONE_SENT: Final = (math.nan, math.nan, math.nan)
 NO_COMMAND: Final = CurrentCommand(NO_COUNTER, NO_COUNTER, 0.0, False)
-
-
-class Proposal(NamedTuple):
-    """Command computed for a sample, before its deadline is checked."""
-
-    sample: SensorSample
-    step: int
-    requested: float  # By the policy [A]
-    decision: Decision
 
 
 class Interval(NamedTuple):
@@ -52,14 +42,15 @@ class Memory:
         self.deadline_ns = 0  # Time at which the next sample is half a period late, monotonic [ns]
         self.start_ns = 0  # Device time of the first sample [ns]
         self.newest: SensorSample | None = None  # Newest valid sample
+        self.step = 0  # Its index on the grid, once it is to be answered
         self.interval = Interval(0.0, 0.0, False, False)  # Between it and the sample before, in control
         self.missed = 0  # Periods without a valid pair just before it
         self.skipped = 0  # Samples that the node's counter has skipped, and its device time has not
         self.lost = LeakyCount(bench.watch.stop_missed)  # Periods without a valid pair
         self.unobeyed = LeakyCount(bench.watch.stop_missed)  # Periods in which the node obeyed no command
         self.past = NO_PAST  # Last own commands, newest first [A]
+        self._decision: Decision | None = None  # for the newest sample, not sent yet
         self._command = NO_COMMAND  # the last one that was decided
-        self._decide_ns = 0  # and when
         self._answered = False  # it was sent, and answers the newest sample
         self._state = RunState.HOMING if homing else RunState.ACTIVE  # of the cycles
 
@@ -88,12 +79,13 @@ class Memory:
         """Returns True if no sample is missing between two."""
         return before is None or sample.device_time_ns - before.device_time_ns < self.period_ns * 3 // 2
 
-    def miss(self) -> int:
-        """Move the deadline on by a period; returns the old one."""
+    def miss(self) -> tuple[int, int]:
+        """Move the deadline on by a period; returns the old one, and how many have passed since the newest sample."""
         # Not the clock: after a stall frames are waiting in the socket, and they come first.
-        deadline_ns = self.deadline_ns
+        sample, deadline_ns = self.newest, self.deadline_ns
+        assert sample is not None
         self.deadline_ns += self.period_ns
-        return deadline_ns
+        return deadline_ns, (deadline_ns - sample.receive_time_ns) // self.period_ns
 
     def follow(self, before: SensorSample, sample: SensorSample) -> None:
         """Count the periods between two samples, and whether the node obeyed."""
@@ -130,18 +122,20 @@ class Memory:
         for _ in range(min(missed, len(NO_PAST))):
             self._remember(0.0)
 
-    def decided(self, command: CurrentCommand, decide_ns: int) -> None:
-        """Store a command that was decided at a monotonic time [ns]."""
-        self._command, self._decide_ns = command, decide_ns
+    def decided(self, decision: Decision, command: CurrentCommand) -> None:
+        """Store a decision on the newest sample, and the command made of it."""
+        self._decision, self._command = decision, command
 
-    def answered(self, proposal: Proposal, send_ns: int) -> None:
-        """Count and record the command that was decided last, handed to the bus at a monotonic time [ns]."""
-        sample, step, requested, decision = proposal
-        command, self._answered = self._command, True
+    def answered(self, decide_ns: int, send_ns: int) -> None:
+        """Count and record the command of the last decision, handed to the bus; monotonic times of both [ns]."""
+        sample, decision, command = self.newest, self._decision, self._command
+        assert sample is not None
+        assert decision is not None
+        self._decision, self._answered = None, True
         self._remember(command.current)
         self.counters.count_answer(decision.reasons, command.current)
-        currents = requested, decision.clipped, command.current
-        self.record(sample, step, decision.reasons, self.missed, self._decide_ns, currents, command.counter, send_ns)
+        times, currents = (decide_ns, send_ns), (decision.requested, decision.clipped, command.current)
+        self.record(sample, self.step, decision.reasons, self.missed, times, currents, command.counter)
 
     def unanswered(self, sample: SensorSample, missed: int, decide_ns: int = 0, reasons: int = 0) -> None:
         """Count and record a sample for which nothing is sent: the node brakes in its period.
@@ -154,7 +148,7 @@ class Memory:
         self.counters.left += bool(reasons)
         if not reasons:
             self.unobeyed.reject()
-        self.record(sample, self.step_of(sample), reasons or MISSED, missed, decide_ns)
+        self.record(sample, self.step_of(sample), reasons or MISSED, missed, (decide_ns, 0))
 
     def _remember(self, current: float) -> None:
         self.past = (current, *self.past[:4])
@@ -165,16 +159,16 @@ class Memory:
         step: int,
         reasons: int,
         missed: int,
-        decide_ns: int = 0,
+        times: tuple[int, int] = (0, 0),
         currents: tuple[float, float, float] = NONE_SENT,
         command_counter: int = NO_COUNTER,
-        send_ns: int = 0,
     ) -> None:
-        """Record a cycle; ``currents`` are those of the policy, clipped, and sent [A]."""
+        """Record a cycle: times of decision and sending [ns]; currents of the policy, clipped, and sent [A]."""
         counter, angle, velocity, device_ns, receive_ns, applied, _, node_state = sample
         of_cycle = step, self._state, int(reasons), counter, command_counter, missed, node_state
-        times = device_ns, receive_ns, self.read_ns, decide_ns, send_ns
-        self.records.append(tuple.__new__(CycleRecord, (*of_cycle, angle, velocity, applied, *currents, *times)))
+        before = device_ns, receive_ns, self.read_ns
+        values = *of_cycle, angle, velocity, applied, *currents, *before, *times
+        self.records.append(tuple.__new__(CycleRecord, values))
 
 
 def latest_answer_ns(bench: Bench) -> int:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from typing import Final
 
-from emb_runtime.control.memory import Proposal
 from emb_runtime.control.monitors import IDLE, OBEYING
 from emb_runtime.control.setup import Setup
 from emb_runtime.control.start_conditions import READY_PAIRS
@@ -48,7 +47,7 @@ class Phase:
         """Process a valid sample; returns the next phase."""
         raise NotImplementedError
 
-    def propose(self) -> Proposal | None:
+    def decide(self) -> Decision | None:
         """Decide on a command for the newest sample, after all frames of a read; a phase without commands: None."""
         self.miss()
         return None
@@ -69,8 +68,11 @@ class Silent(Phase):
     @property
     def deadline_ns(self) -> int:
         """Time until which the next frames are waited for, monotonic [ns]."""
-        give_up_ns = self.machine.run.since_ns + round(self.setup.bench.watch.start_timeout * 1e9)
-        return min(give_up_ns, self.memory.read_ns + SILENT_WAIT * self.memory.period_ns)
+        return min(self._give_up_ns, self.memory.read_ns + SILENT_WAIT * self.memory.period_ns)
+
+    @property
+    def _give_up_ns(self) -> int:
+        return self.machine.run.since_ns + round(self.setup.bench.watch.start_timeout * 1e9)
 
     def process_sample(self, sample: SensorSample) -> Phase:
         """Arm, if the node is ready."""
@@ -89,12 +91,11 @@ class Silent(Phase):
 
     def miss(self) -> None:
         """Give up a node that has not shown itself in time."""
-        try:
-            self.machine.handle_event(Event.TIME, self.memory.read_ns)
-        except StopError as stop:
+        if self.memory.read_ns >= self._give_up_ns:
             unpaired = self.setup.reception.pairing_problem
-            fault = Fault.NODE_NOT_READY if unpaired else stop.fault
-            raise StopError(fault, self._not_ready or unpaired or stop.detail) from None
+            fault = Fault.NODE_NOT_READY if unpaired or self.memory.newest is not None else Fault.NO_NODE
+            waited = f"within {self.setup.bench.watch.start_timeout:g} s"
+            raise StopError(fault, self._not_ready or unpaired or waited)
 
 
 class Control(Phase):
@@ -127,7 +128,7 @@ class Control(Phase):
         phase._unanswered = sample
         return phase
 
-    def propose(self) -> Proposal | None:
+    def decide(self) -> Decision | None:
         """Check the newest sample, and decide on a command for it; None at the last one, which ends the run."""
         sample, self._unanswered = self._unanswered, None
         if sample is None:
@@ -140,7 +141,7 @@ class Control(Phase):
         else:
             returns = setup.homing or estimate.goal_ns is not None
             self._at_home = self._at_home + 1 if returns and setup.bounds.is_home(sample) else 0
-        step = memory.step_of(sample)
+        step = memory.step = memory.step_of(sample)
         if self._is_last(step):
             self._finish(sample, step)
             return None
@@ -150,12 +151,16 @@ class Control(Phase):
             memory.pass_missed(memory.missed)
         estimate.estimator.take(sample.angle, sample.velocity, step, sample.applied_current)
         request = setup.actor.act(sample.angle, sample.velocity, step, estimate.estimator)
-        requested = checked(request, setup.current_limit)
-        return tuple.__new__(Proposal, (sample, step, requested, self._command(sample, requested, step)))
+        return self._command(sample, checked(request, setup.current_limit), step)
 
     def miss(self) -> None:
         """Count a period without a sample; too many in a row end the run."""
-        self.machine.handle_event(Event.TIME, self.memory.miss())
+        memory, watch = self.memory, self.setup.bench.watch
+        deadline_ns, silent = memory.miss()
+        if silent >= watch.stop_missed:
+            raise StopError(Fault.SENSOR_LOST, f"{silent} periods without a valid pair")
+        if silent == watch.soft_missed:
+            self.machine.note(Fault.SENSOR_LATE, f"{silent} so far", deadline_ns)
 
     def _begin(self, sample: SensorSample) -> None:
         setup, memory = self.setup, self.memory
@@ -187,15 +192,17 @@ class Control(Phase):
     def _command(self, sample: SensorSample, requested: float, step: int) -> Decision:
         """Command for a sample, in the shield's view of time: on the way home the end is always near."""
         setup, memory, sensors, limits = self.setup, self.memory, self.setup.sensors, self.setup.command_limits
-        last, returns = memory.slew_reference(sample), setup.estimate.goal_ns is not None
+        last, returns, wanted = memory.slew_reference(sample), setup.estimate.goal_ns is not None, requested
         if setup.homing:
             step = setup.late_step
         elif returns:
-            step, requested = max(step, setup.late_step), 0.0
+            step, wanted = max(step, setup.late_step), 0.0
         if (most := sensors.monitor.largest_current(limits.current)) < limits.current:
             limits = limits._replace(current=max(most, abs(last) - limits.slew))  # down to it as fast as may be
-        decision = decide(sensors.law, limits, sample.angle, sample.velocity, requested, memory.past, last, step)
-        return decision._replace(reasons=decision.reasons | Reason.RETURNING) if returns else decision
+        decision = decide(sensors.law, limits, sample.angle, sample.velocity, wanted, memory.past, last, step)
+        if returns:
+            return decision._replace(requested=requested, reasons=decision.reasons | Reason.RETURNING)
+        return decision
 
     def _finish(self, sample: SensorSample, step: int) -> None:
         """Check the whole run at its last sample."""
@@ -246,7 +253,7 @@ class Coasting(Control):
     def _command(self, sample: SensorSample, requested: float, step: int) -> Decision:
         """0 A, as fast as may be."""
         last, slew = self.memory.slew_reference(sample), self.setup.command_limits.slew
-        return Decision(0.0, min(max(0.0, last - slew), last + slew), int(Reason.LIMITED))
+        return Decision(requested, 0.0, min(max(0.0, last - slew), last + slew), int(Reason.LIMITED))
 
 
 class Stopping(Phase):

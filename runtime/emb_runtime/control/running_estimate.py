@@ -23,8 +23,8 @@ class RunningEstimate:
         self._condition = condition
         self._available = not homing and bool(estimated(bench))  # there is an estimate, and it was finite so far
 
-    def record(self, sample: SensorSample, step: int, memory: Memory) -> None:
-        """Record the estimate at a sample; once it is not finite, the run has none."""
+    def record(self, sample: SensorSample, memory: Memory) -> None:
+        """Record the estimate at the newest sample; once it is not finite, the run has none."""
         if not self._available:
             return
         self.numbers = numbers = self.estimator.estimate
@@ -33,7 +33,7 @@ class RunningEstimate:
             text = "not finite: the measurements do not fit the bench's noise; the run goes on without an estimate"
             memory.note(sample.receive_time_ns, LOST, text)
             return
-        memory.records.append(EstimateRecord(sample.receive_time_ns, step, numbers))
+        memory.records.append(EstimateRecord(sample.receive_time_ns, memory.step, numbers))
         condition = self._condition
         if condition is not None and self.goal_ns is None and condition.reached(numbers):
             self.goal_ns = sample.device_time_ns - memory.start_ns

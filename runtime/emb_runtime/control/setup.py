@@ -37,7 +37,7 @@ class Setup:
         """Make the parts."""
         bench, law = self.bench, self.law
         self.memory = memory = Memory(bench, homing=self.homing)
-        self.machine = StateMachine(bench, memory.note)
+        self.machine = StateMachine(memory.note)
         self.reception = Reception(
             self.layout, bench, lambda frame, why: memory.note(frame.time_ns, "FRAME_REJECTED", why)
         )

@@ -26,6 +26,7 @@ class CommandLimits(NamedTuple):
 class Decision(NamedTuple):
     """Command made of a request, and the reasons for a change."""
 
+    requested: float  # By the policy [A]
     clipped: float  # The request within the limit [A]
     current: float  # To be sent [A]; NaN: nothing is, and the node brakes in this period
     reasons: int  # :class:`~emb_runtime.records.Reason` bits
@@ -91,4 +92,4 @@ def decide(
     current, bits = shielded(law, angle, velocity, clipped, past, step, low, high)
     if clipped != requested:
         bits |= CLIPPED
-    return tuple.__new__(Decision, (clipped, current, bits))
+    return tuple.__new__(Decision, (requested, clipped, current, bits))

@@ -13,7 +13,6 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-from emb_runtime.config.bench import Bench
 from emb_runtime.errors import EXIT_BUS, EXIT_DONE, EXIT_SAFETY_STOP, EXIT_UNEXPLAINED
 from emb_runtime.records import RunState
 
@@ -25,10 +24,8 @@ class Event(IntEnum):
     NODE_READY = 1  # The node has shown itself: valid pairs, idle, where the run may begin
     BEGIN = 2  # The first sample of the experiment is in hand
     BEGIN_HOMING = 3  # The first sample of the way home is in hand
-    PAIR = 4  # A valid sensor pair came
-    TIME = 5  # Time has passed, and nothing else happened
-    FINISHED = 6  # The last sample has come
-    STOPPED = 7  # The stop frames are out, and the node has been given its time to come to rest
+    FINISHED = 4  # The last sample has come
+    STOPPED = 5  # The stop frames are out, and the node has been given its time to come to rest
 
 
 class Fault(IntEnum):
@@ -73,8 +70,6 @@ class Run(NamedTuple):
 
     state: RunState = RunState.INIT
     since_ns: int = 0  # Beginning of this state, monotonic [ns]
-    last_pair_ns: int = 0  # Arrival of the last valid pair; 0 before the first [ns]
-    late: bool = False  # The soft limit of missed periods has been reached since then
     fault: Fault | None = None  # The first one that latched
 
 
@@ -87,35 +82,22 @@ _NEXT: Final[dict[tuple[RunState, Event], RunState]] = {
     (RunState.HOMING, Event.FINISHED): RunState.STOPPING,
     (RunState.STOPPING, Event.STOPPED): RunState.OVER,
 }
-_LISTENING: Final = (RunState.SILENT, RunState.ARMED, RunState.ACTIVE, RunState.HOMING, RunState.STOPPING)
-_WATCHED: Final = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)  # States in which the node must be heard
-_PAIR: Final = Event.PAIR
 _ENABLING: Final = (RunState.ACTIVE, RunState.HOMING)
 _SENDING: Final = (*_ENABLING, RunState.STOPPING)
 
 
-def step(bench: Bench, run: Run, event: Event | Fault, now_ns: int) -> Run:
+def step(run: Run, event: Event | Fault, now_ns: int) -> Run:
     """State of a run after an event at a monotonic time [ns].
 
     Raises:
         ValueError: the event cannot happen in that state, which is an error in the program.
     """
-    if event is _PAIR and run.state in _LISTENING:
-        return tuple.__new__(Run, (run.state, run.since_ns, now_ns, False, run.fault))
     if isinstance(event, Fault):
         return _faulted(run, event, now_ns)
-    if event is Event.TIME:
-        return _waited(bench, run, now_ns)
     try:
         return run._replace(state=_NEXT[run.state, event], since_ns=now_ns)
     except KeyError:
         raise ValueError(f"{event.name} cannot happen in {run.state.name}") from None
-
-
-def missed(bench: Bench, run: Run, now_ns: int) -> int:
-    """Sampling periods in a row that have passed without a valid pair; one counts when it is half a period overdue."""
-    period_ns = bench.timing.sample_time_ns
-    return max(0, (2 * (now_ns - run.last_pair_ns) - period_ns) // (2 * period_ns))
 
 
 def _faulted(run: Run, fault: Fault, now_ns: int) -> Run:
@@ -127,17 +109,6 @@ def _faulted(run: Run, fault: Fault, now_ns: int) -> Run:
     # Before arming nothing has left, so there is nothing to stop; after it, every way out sends stop frames.
     nothing_sent = run.state in (RunState.INIT, RunState.SILENT)
     return run._replace(state=RunState.OVER if nothing_sent else RunState.STOPPING, since_ns=now_ns, fault=first)
-
-
-def _waited(bench: Bench, run: Run, now_ns: int) -> Run:
-    if run.state is RunState.SILENT and now_ns - run.since_ns >= round(bench.watch.start_timeout * 1e9):
-        return _faulted(run, Fault.NODE_NOT_READY if run.last_pair_ns else Fault.NO_NODE, now_ns)
-    if run.state in _WATCHED:
-        silent = missed(bench, run, now_ns)
-        if silent >= bench.watch.stop_missed:
-            return _faulted(run, Fault.SENSOR_LOST, now_ns)
-        return run._replace(late=run.late or silent >= bench.watch.soft_missed)
-    return run
 
 
 def may_send(state: RunState) -> bool:
@@ -289,25 +260,19 @@ class StateMachine:
 
     _latched: tuple[Run, int]  # State before the fault that was latched last, and its time [ns]
 
-    def __init__(self, bench: Bench, push_event: Callable[[int, str, str], object]) -> None:
-        self._bench = bench
+    def __init__(self, push_event: Callable[[int, str, str], object]) -> None:
         self._push_event = push_event
         self.run = Run()
 
     def handle_event(self, event: Event, now_ns: int) -> None:
-        """Take an event; raises StopError if the run has failed by it: whoever catches the error latches the fault."""
-        before, after = self.run, step(self._bench, self.run, event, now_ns)
-        if after.fault is not None and before.fault is None:
-            raise StopError(after.fault, self._detail(before, now_ns))
-        if after.late and not before.late:
-            self.note(Fault.SENSOR_LATE, f"{missed(self._bench, before, now_ns)} so far", now_ns)
-        self.run = after
+        """Take an event."""
+        before, self.run = self.run, step(self.run, event, now_ns)
         self._note_change(before, event, now_ns)
 
     def latch(self, fault: Fault, now_ns: int) -> None:
         """Take a fault that latches; :meth:`explain` records it, once the stop has begun."""
         self._latched = self.run, now_ns
-        self.run = step(self._bench, self.run, fault, now_ns)
+        self.run = step(self.run, fault, now_ns)
 
     def explain(self, fault: Fault, detail: str) -> None:
         """Record the fault that was latched last, and the change of the state."""
@@ -323,8 +288,3 @@ class StateMachine:
     def _note_change(self, before: Run, event: Event | Fault, now_ns: int) -> None:
         if self.run.state is not before.state:
             self._push_event(now_ns, self.run.state.name, f"after {event.name}")
-
-    def _detail(self, run: Run, now_ns: int) -> str:
-        if run.state is RunState.SILENT:
-            return f"within {self._bench.watch.start_timeout:g} s"
-        return f"{missed(self._bench, run, now_ns)} periods without a valid pair"

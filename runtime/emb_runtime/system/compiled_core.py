@@ -12,8 +12,8 @@ Idioms that only speed or the compiler asks for, in the modules that are compile
 
 * ``tuple.__new__(Frame, (...))``, all fields in their order: the constructor of a named tuple is interpreted, also
   where compiled code calls it, and takes twice as long.
-* ``PAIR: Final = Event.PAIR``, ``MISSED: Final = int(Reason.MISSED)``: in Python 3.11 a member of an enumeration takes
-  as long as a call, and an ``IntFlag`` combines its members in Python.
+* ``IDLE: Final = NodeState.IDLE``, ``MISSED: Final = int(Reason.MISSED)``: in Python 3.11 a member of an enumeration
+  takes as long as a call, and an ``IntFlag`` combines its members in Python.
 * A name of its own for each ``except … as name``: mypyc gives a name the type of the function's first clause, and
   another exception becomes a TypeError.
 * ``Number`` (``can/codec.py``) for what may be an int or a float: the annotation ``float`` converts ints.

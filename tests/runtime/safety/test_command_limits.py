@@ -116,4 +116,4 @@ DECIDED = [
 
 def test_limit_and_slew_hold_a_wish_back_and_say_so() -> None:
     for limit, slew, angle, wanted, last, expected in DECIDED:
-        assert decide(LAW, CommandLimits(limit, slew), angle, 0.0, wanted, NO_PAST, last, 10) == expected
+        assert decide(LAW, CommandLimits(limit, slew), angle, 0.0, wanted, NO_PAST, last, 10) == (wanted, *expected)

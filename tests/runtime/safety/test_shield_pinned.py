@@ -57,5 +57,8 @@ def test_decisions_are_the_same_to_the_last_bit(name: str) -> None:
         if dice.random() < 0.3:  # near home, where the way home ends
             state = dice.uniform(-0.6, 0.6), dice.uniform(-30.0, 30.0)
         a, b, c, d, e = (dice.uniform(-6.0, 6.0) for _ in range(5))
-        found += decide(law, limits, *state, dice.uniform(-7.0, 7.0), (a, b, c, d, e), a, dice.randrange(law.steps))
+        requested = dice.uniform(-7.0, 7.0)
+        decision = decide(law, limits, *state, requested, (a, b, c, d, e), a, dice.randrange(law.steps))
+        assert decision.requested == requested
+        found += decision[1:]
     assert digest(found) == expected
