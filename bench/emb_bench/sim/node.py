@@ -18,7 +18,6 @@ import math
 
 from emb_bench.config.plants import BUILT_IN, DEFAULT_PLANT, Plant
 from emb_bench.sim.simulated_brake import Noise, SimulatedBrake
-from emb_runtime.can.codec import Signal
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, CounterCheck, next_counter
 from emb_runtime.can.messages import Layout, StopReason, bench_identity
 from emb_runtime.config.bench import Bench, BrakeParameters
@@ -173,13 +172,9 @@ class BrakeNode(SimulatedBrake):
         layout, counter = self._layout, self._counter
         time_ns = self.periods * self._bench.timing.sample_time_ns
         frames = [
-            layout.encode_angle(counter, _saturated(angle, layout.angle.signal("Angle")), time_ns),
+            layout.encode_angle(counter, layout.angle.signal("Angle").saturated(angle), time_ns),
             layout.encode_velocity(
-                counter,
-                _saturated(velocity, layout.velocity.signal("Velocity")),
-                applied,
-                self.state,
-                answered_by,
+                counter, layout.velocity.signal("Velocity").saturated(velocity), applied, self.state, answered_by
             ),
         ]
         if self._charge is not None:
@@ -189,8 +184,3 @@ class BrakeNode(SimulatedBrake):
             self._status = next_counter(number), self.periods + STATUS_PERIODS
             frames.append(layout.encode_status(number, self.state, self.stop_reason, self.rejected, self._identity))
         return frames
-
-
-def _saturated(value: float, signal: Signal) -> float:
-    """Value within a signal's range: a sensor beyond it shows its end; it does not wrap or stop sending."""
-    return min(max(value, signal.minimum), signal.maximum)

@@ -65,6 +65,10 @@ class Signal:
         """The range for a message."""
         return f"a value from {self.minimum:g} to {self.maximum:g} {self.unit}".rstrip()
 
+    def saturated(self, value: Number) -> Number:
+        """A value within the range: a sensor beyond it shows its end; it does not wrap or stop sending."""
+        return min(max(value, self.minimum), self.maximum)
+
 
 @dataclass(frozen=True)
 class Message:

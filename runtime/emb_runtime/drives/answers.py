@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-from emb_runtime.can.codec import Signal
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, CounterCheck
 from emb_runtime.can.messages import Layout, StopReason, bench_identity
 from emb_runtime.config.bench import Bench
@@ -90,9 +89,9 @@ class Answers:
         self._counter = (self._counter + 1) % COUNTER_MODULUS
         self.sample, self._answered, self.missed = sample, False, False
         self.samples += 1
-        angle = _saturated(sample.angle, layout.angle.signal("Angle"))
-        velocity = _saturated(sample.velocity, layout.velocity.signal("Velocity"))
-        applied = _saturated(applied, layout.velocity.signal("AppliedCurrent"))
+        angle = layout.angle.signal("Angle").saturated(sample.angle)
+        velocity = layout.velocity.signal("Velocity").saturated(sample.velocity)
+        applied = layout.velocity.signal("AppliedCurrent").saturated(applied)
         obeyed, self._obeyed_counter = self._obeyed_counter, NO_COUNTER
         frames = [
             layout.encode_angle(self._counter, angle, device_ns),
@@ -102,8 +101,3 @@ class Answers:
             number = status % COUNTER_MODULUS
             frames.append(layout.encode_status(number, state, reason, self.refused, self._identity))
         return [frame._replace(time_ns=sample.time_ns) for frame in frames]
-
-
-def _saturated(value: float, signal: Signal) -> float:
-    """Value within a signal's range: what is beyond shows its end."""
-    return min(max(value, signal.minimum), signal.maximum)

@@ -223,6 +223,14 @@ def test_device_time_between_two_steps_is_rounded_up() -> None:
         assert LAYOUT.decode_angle(LAYOUT.encode_angle(0, 0.0, time_ns)).device_time_ns == rounded
 
 
+@pytest.mark.parametrize("value", [-1e9, -100.0, 12.5, 100.0, 1e9])
+def test_a_value_beyond_the_range_of_a_signal_shows_its_end(value: float) -> None:
+    angle = LAYOUT.angle.signal("Angle")
+    expected = sorted((angle.minimum, value, angle.maximum))[1]
+    assert angle.saturated(value) == expected
+    LAYOUT.encode_angle(0, angle.saturated(value), 0)
+
+
 def test_the_count_of_rejected_commands_saturates() -> None:
     for rejected, sent in [(0, 0), (65_535, 65_535), (65_536, 65_535), (10**9, 65_535)]:
         frame = LAYOUT.encode_status(0, NodeState.FAULT, StopReason.LIMIT, rejected, 0)
