@@ -21,6 +21,7 @@ class Estimator:
         """Make the model, and begin."""
         self.model = make_model(bench, bench.range_set(bench.prior))
         self.state: State = start(self.model)
+        self._computed: tuple[State | None, tuple[float, ...]] = None, ()  # the parameters, and the state they are of
 
     def begin(self) -> None:
         """Begin anew: the next sample is the first one of a run."""
@@ -43,8 +44,15 @@ class Estimator:
 
     @property
     def parameters(self) -> tuple[float, ...]:
-        """k_m, k_1, T_c and f_v in SI units, then their standard deviations: 0 of one that the prior does not open."""
-        return self.in_si(self.relative) + self.in_si(deviations(self.model, self.state))
+        """k_m, k_1, T_c and f_v in SI units, then their standard deviations: 0 of one that the prior does not open.
+
+        Computed once a sample: the policy takes them before the command leaves, the log after it.
+        """
+        state, parameters = self._computed
+        if state is not self.state:
+            parameters = self.in_si(self.relative) + self.in_si(deviations(self.model, self.state))
+            self._computed = self.state, parameters
+        return parameters
 
     @property
     def fits(self) -> bool:

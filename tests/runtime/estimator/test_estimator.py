@@ -48,7 +48,8 @@ def test_it_takes_samples_and_begins_anew() -> None:
         before = estimator.state
         estimator.take(*sample)
         assert estimator.state == follow(estimator.model, before, *sample)
-    assert estimator.parameters == estimator.estimate != Estimator(BENCH).estimate
+    assert estimator.parameters is estimator.parameters is estimator.estimate  # computed once a sample
+    assert estimator.parameters != Estimator(BENCH).estimate
     one = Estimator(one_bench := dataclasses.replace(BENCH, prior="viscous"))
     for sample in SAMPLES:
         one.take(*sample)
