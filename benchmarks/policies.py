@@ -27,8 +27,7 @@ from emb_bench.excitation import ACTOR, parse_excitation
 from emb_bench.information.symmetric import Floats
 from emb_bench.parallel import processes
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.policy.inference import Inference
-from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
+from emb_runtime.policy.policy import Inference, Policy, load_policy, shipped_actor_path
 from emb_train.closed_loop import Conditions
 from emb_train.intervals import intervals
 from emb_train.play import Estimating, Excitation, Law, Planned, Played, fresh_draws, play

@@ -44,7 +44,7 @@ MODULES = (
         for path in sorted((ROOT / "runtime" / PACKAGE / room).glob("*.py"))
         if path.stem != "__init__" and f"{room}.{path.stem}" not in LEFT_OUT
     ),
-    *("log.recorder", "policy.inference", "policy.policy"),
+    *("log.recorder", "policy.policy"),
 )
 """Modules that are compiled: those whose functions run once per cycle, and their neighbours."""
 LIBRARY = "emb_core"

@@ -36,9 +36,8 @@ from emb_runtime.policy.contract import (
     VECTOR_TOLERANCE,
     greatest_output,
 )
-from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME, open_session
 from emb_runtime.policy.onnx_file import read_graph, require_bounded
-from emb_runtime.policy.policy import MAX_FILE_BYTES
+from emb_runtime.policy.policy import INPUT_NAME, MAX_FILE_BYTES, OUTPUT_NAME, open_session
 from emb_runtime.system.input_file import read_bytes
 
 OBSERVATIONS = 2000

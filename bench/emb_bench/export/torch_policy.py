@@ -22,7 +22,7 @@ from emb_bench.export.policy_file import OPSET, printable, versions
 from emb_bench.information.symmetric import Floats
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.contract import greatest_output
-from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME
+from emb_runtime.policy.policy import INPUT_NAME, OUTPUT_NAME
 
 SPACE = "expected the spaces of EmbExcitation-v0: Box observations of 3 or 11 numbers, one action from -1 to 1"
 

@@ -36,9 +36,8 @@ from emb_runtime.policy.contract import (
     Vector,
     read_contract,
 )
-from emb_runtime.policy.inference import open_session
 from emb_runtime.policy.onnx_file import FIXED, MAX_PARTS, read_graph
-from emb_runtime.policy.policy import MAX_FILE_BYTES, load_policy, shipped_actor_path
+from emb_runtime.policy.policy import MAX_FILE_BYTES, load_policy, open_session, shipped_actor_path
 from emb_runtime.safety.command_limits import checked
 from emb_runtime.safety.state_machine import Fault, StopError
 from tests.actors import constant_actor, contract_for, parsed, with_contract
