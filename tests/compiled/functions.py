@@ -17,7 +17,7 @@ from typing import Any
 from emb_runtime.can import e2e, receiver
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import Bench, load_bench
-from emb_runtime.control import result, start_conditions
+from emb_runtime.control import memory, start_conditions
 from emb_runtime.estimator import kalman, speed_loop
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.records import CurrentCommand, Frame, NodeState, RunState, SensorSample
@@ -269,7 +269,7 @@ def _states(dice: random.Random) -> Iterator[Any]:
 
 
 def _bounds(dice: random.Random) -> Iterator[Any]:
-    bounds, counters = start_conditions.Bounds(_bench()), result.RunCounters()
+    bounds, counters = start_conditions.Bounds(_bench()), memory.RunCounters()
     while True:
         angle, velocity, applied = _number(dice, 110.0), _number(dice, 510.0), _number(dice, 6.0)
         sample = SensorSample(dice.randrange(15), angle, velocity, 0, 0, applied, 15, NodeState.ACTIVE)

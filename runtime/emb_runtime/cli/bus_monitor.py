@@ -22,13 +22,20 @@ if TYPE_CHECKING:
 
 ENOUGH_PAIRS = 200  # Sensor pairs from which a standard deviation is known to within a twentieth
 RECENT_PAIRS = 4000  # Pairs that the scatter is taken from
-NO_SCATTER = (math.nan, math.nan)  # Of fewer than two pairs
 OTHERS_BITS = worst_bits(8)  # Bits of a foreign frame, counted as one of 8 bytes with an 11-bit identifier
 
 
 def planned_load(bench: Bench, layout: Layout, drive: DriveMapping | None) -> float:
     """Worst-case share of the bus that a run takes, 1.0 being all of it: of a mapped drive's own, if there is one."""
     return layout.bus_load(bench.can.bitrate) if drive is None else drive.bus_load(bench.timing.sample_time)
+
+
+class Scatter(NamedTuple):
+    """Scatter of the sensors at rest."""
+
+    pairs: int  # Number of the newest pairs, all of an idle node, that it is of
+    angle: float  # Standard deviation; NaN for fewer than two pairs [rad]
+    velocity: float  # [rad/s]
 
 
 @dataclass(frozen=True)
@@ -50,19 +57,17 @@ class BusStatistics:
     pairs: int  # Valid sensor pairs
     missing: int  # Pairs that did not come, by the node's own clock
     period: float  # Median time between samples by the node's own clock [s]; NaN with fewer than two
-    resting: int  # Number of the newest pairs, all of an idle node, that the next two are of
-    angle_scatter: float  # Standard deviation of the angles; NaN for fewer than two [rad]
-    velocity_scatter: float  # The same of the velocities [rad/s]
+    scatter: Scatter
     status: StatusFrame | None  # The node's latest
     sample: SensorSample | None  # The newest valid one
 
     def document(self) -> dict[str, Any]:
         """The statistics as plain data."""
-        node = {
+        records = {
             name: record and {key: getattr(value, "name", value) for key, value in record._asdict().items()}
-            for name, record in (("status", self.status), ("sample", self.sample))
+            for name, record in (("scatter", self.scatter), ("status", self.status), ("sample", self.sample))
         }
-        return asdict(self) | node
+        return asdict(self) | records
 
 
 class Seen(NamedTuple):
@@ -121,8 +126,8 @@ class BusMonitor:
         known = {name: s for name, s in seen.items() if name is not None}
         frames, others = {name: s.frames for name, s in known.items()}, seen[None].frames if None in seen else 0
         bits = OTHERS_BITS * others + sum(m.worst_bits * frames.get(m.name, 0) for m in self._layout.known)
-        scatter = map(statistics.stdev, zip(*self._at_rest, strict=True)) if len(self._at_rest) > 1 else NO_SCATTER
-        angle_scatter, velocity_scatter = scatter
+        enough = len(self._at_rest) > 1
+        scatter = map(statistics.stdev, zip(*self._at_rest, strict=True)) if enough else (math.nan, math.nan)
         return BusStatistics(
             duration=duration,
             frames=frames,
@@ -138,9 +143,7 @@ class BusMonitor:
             pairs=self.pairs,
             missing=self._missing,
             period=statistics.median(self._periods_ns) * 1e-9 if self._periods_ns else math.nan,
-            resting=len(self._at_rest),
-            angle_scatter=angle_scatter,
-            velocity_scatter=velocity_scatter,
+            scatter=Scatter(len(self._at_rest), *scatter),
             status=reception.status,
             sample=self.sample,
         )

@@ -204,11 +204,7 @@ def _samples(f: Findings) -> Check:
 
 
 def _noise(f: Findings) -> Check:
-    angle, velocity, noise = (
-        f.statistics.angle_scatter,
-        f.statistics.velocity_scatter,
-        f.plan.bench.noise,
-    )
+    (_, angle, velocity), noise = f.statistics.scatter, f.plan.bench.noise
     expected = (
         f"at most {SCATTER_TOLERANCE:g} times {noise.angle:g} rad and {noise.velocity:g} rad/s; the shield allows "
         f"for {f.plan.bench.shield.noise_sigmas:g} times that"

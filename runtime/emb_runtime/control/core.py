@@ -242,7 +242,7 @@ class Core:
             counters=counters,
             end=end,
             last=memory.newest,
-            home=self.fault is None and end is not None and setup.bounds.is_home(end),
+            home=self.fault is None and end is not None and setup.conditions.bounds.is_home(end),
             node_at_rest=self._stopping is not None and self._stopping.rests,
             node_stop_reason=reception.stop_reason,
             duration_ns=end.device_time_ns - memory.start_ns if end and memory.start_ns else 0,

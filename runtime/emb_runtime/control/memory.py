@@ -6,17 +6,20 @@ Missed periods are counted by device time, between two samples; until the next s
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, LeakyCount, next_counter
 from emb_runtime.config.bench import Bench
-from emb_runtime.control.result import RunCounters
 from emb_runtime.log.ring_buffer import EventRecord, Record
 from emb_runtime.records import CurrentCommand, CycleRecord, Reason, RunState, SensorSample
 from emb_runtime.safety.command_limits import Decision
 from emb_runtime.safety.guard import OLDEST_SAMPLE_PERIODS
 from emb_runtime.safety.shield import NO_PAST
 
+CLIPPED: Final = int(Reason.CLIPPED)
+LIMITED: Final = int(Reason.LIMITED)
+RETURNING: Final = int(Reason.RETURNING)
 MISSED: Final = int(Reason.MISSED)
 NONE_SENT: Final = (math.nan, math.nan, math.nan)
 NO_COMMAND: Final = CurrentCommand(NO_COUNTER, NO_COUNTER, 0.0, False)
@@ -29,6 +32,45 @@ class Interval(NamedTuple):
     command: float  # That answered the sample before; 0 if none was sent [A]
     obeyed: bool  # True if the node says that this command acted
     follows: bool  # True if nothing is missing between the two samples either
+
+
+@dataclass
+class RunCounters:
+    """Counts and extremes of a run."""
+
+    pairs: int = 0  # Valid sensor pairs from the first sample to the closing one, which needs no answer
+    answered: int = 0  # Pairs answered by a command
+    unanswered: int = 0  # Pairs that got none: overtaken by a newer one, or nothing could or might be sent
+    missed: int = 0  # Sampling periods without a valid pair
+    not_obeyed: int = 0  # Commands that came too late for their period, by the node's own account
+    not_taken: int = 0  # Commands that the interface had no room for; they count as unanswered
+    confirmed: int = 0  # Frames of ours whose echo came back: they were on the bus
+    rejected: int = 0  # Frames rejected by the reception
+    dropped: int = 0  # Frames that the kernel dropped
+    bus_errors: int = 0  # Error frames of the CAN controller
+    clipped: int = 0
+    limited: int = 0  # Commands changed to keep the brake inside its limits
+    returning: int = 0  # Commands that the shield took over to be home in time
+    left: int = 0  # Periods left to the node: what had to be sent lay beyond what may be sent
+    angle_min: float = 0.0
+    angle_max: float = 0.0
+    top_speed: float = 0.0
+    top_current: float = 0.0
+
+    def count_pair(self, sample: SensorSample, missed: int) -> None:
+        """Count a valid pair, and the periods without one just before it."""
+        self.pairs += 1
+        self.missed += missed
+        self.angle_min, self.angle_max = min(self.angle_min, sample.angle), max(self.angle_max, sample.angle)
+        self.top_speed = max(self.top_speed, abs(sample.velocity))
+
+    def count_answer(self, reasons: int, current: float) -> None:
+        """Count a command that was sent, by its :class:`Reason` bits and its current [A]."""
+        self.answered += 1
+        self.clipped += bool(reasons & CLIPPED)
+        self.limited += bool(reasons & LIMITED)
+        self.returning += bool(reasons & RETURNING)
+        self.top_current = max(self.top_current, abs(current))
 
 
 class Memory:

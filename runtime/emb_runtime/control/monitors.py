@@ -18,7 +18,7 @@ from emb_runtime.can.messages import Layout, StatusFrame
 from emb_runtime.can.receiver import Reception
 from emb_runtime.config.bench import Bench
 from emb_runtime.control.memory import Memory
-from emb_runtime.control.start_conditions import Bounds, StartConditions
+from emb_runtime.control.start_conditions import StartConditions
 from emb_runtime.records import NodeState, SensorSample
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.motion_balance import MotionBalance
@@ -37,11 +37,11 @@ Monitor = Callable[[SensorSample, Memory], None]
 """Checks the newest sample; raises StopError."""
 
 
-def monitors(bounds: Bounds, conditions: StartConditions, reception: Reception, guard: Guard) -> tuple[Monitor, ...]:
+def monitors(conditions: StartConditions, reception: Reception, guard: Guard) -> tuple[Monitor, ...]:
     """Monitors of each sample that is to be answered, in the order in which they check it."""
 
     def check_limits(sample: SensorSample, memory: Memory) -> None:
-        if outside := bounds.outside(sample):
+        if outside := conditions.bounds.outside(sample):
             raise StopError(Fault.OUT_OF_LIMITS, outside)
 
     def check_drive(sample: SensorSample, memory: Memory) -> None:

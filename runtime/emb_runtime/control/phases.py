@@ -19,6 +19,7 @@ from emb_runtime.records import Reason, RunState, SensorSample
 from emb_runtime.safety.command_limits import Decision, checked, decide
 from emb_runtime.safety.motion_balance import REST_SAMPLES, unheld_motion
 from emb_runtime.safety.shield import NO_PAST
+from emb_runtime.safety.shield_design import late_step
 from emb_runtime.safety.state_machine import Event, Fault, StopError, may_enable
 
 HOME_PAIRS: Final = 50  # Valid pairs in a row, at home, that end a way home
@@ -103,6 +104,7 @@ class Control(Phase):
 
     def __init__(self, setup: Setup) -> None:
         super().__init__(setup)
+        self._late_step = late_step(setup.law)
         self._at_home = 0  # samples in a row at home, once the brake is to return
         self._unanswered: SensorSample | None = None  # newest sample of the read, which is to be answered
 
@@ -140,7 +142,7 @@ class Control(Phase):
             self._begin(sample)
         else:
             returns = setup.homing or estimate.goal_ns is not None
-            self._at_home = self._at_home + 1 if returns and setup.bounds.is_home(sample) else 0
+            self._at_home = self._at_home + 1 if returns and setup.conditions.bounds.is_home(sample) else 0
         step = memory.step = memory.step_of(sample)
         if self._is_last(step):
             self._finish(sample, step)
@@ -194,9 +196,9 @@ class Control(Phase):
         setup, memory, sensors, limits = self.setup, self.memory, self.setup.sensors, self.setup.command_limits
         last, returns, wanted = memory.slew_reference(sample), setup.estimate.goal_ns is not None, requested
         if setup.homing:
-            step = setup.late_step
+            step = self._late_step
         elif returns:
-            step, wanted = max(step, setup.late_step), 0.0
+            step, wanted = max(step, self._late_step), 0.0
         if (most := sensors.monitor.largest_current(limits.current)) < limits.current:
             limits = limits._replace(current=max(most, abs(last) - limits.slew))  # down to it as fast as may be
         decision = decide(sensors.law, limits, sample.angle, sample.velocity, wanted, memory.past, last, step)
@@ -223,7 +225,7 @@ class Control(Phase):
             found = f"{acted} of {periods} periods had a sample and a command that acted"
             raise StopError(Fault.INCOMPLETE, f"{found}, at least {COVERAGE:.0%} must")
         # Below the bench's limit the shield cannot always bring the brake home in time: that is the operator's choice.
-        if not setup.bounds.is_home(end) and setup.limit >= setup.bench.limits.current:
+        if not setup.conditions.bounds.is_home(end) and setup.limit >= setup.bench.limits.current:
             found = f"at {end.angle:.2f} rad and {end.velocity:.1f} rad/s after {periods} periods"
             raise StopError(Fault.INCOMPLETE, f"the brake is not home: {found}")
 

@@ -1,58 +1,16 @@
-"""Result of a run: its counters, and how it ended."""
+"""Result of a run: how it ended."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Final
+from typing import Any
 
 from emb_runtime.can.messages import StopReason
-from emb_runtime.records import Reason, SensorSample
+from emb_runtime.control.memory import RunCounters
+from emb_runtime.records import SensorSample
 from emb_runtime.safety.state_machine import Fault
-
-_CLIPPED: Final = int(Reason.CLIPPED)
-_LIMITED: Final = int(Reason.LIMITED)
-_RETURNING: Final = int(Reason.RETURNING)
-
-
-@dataclass
-class RunCounters:
-    """Counts and extremes of a run."""
-
-    pairs: int = 0  # Valid sensor pairs from the first sample to the closing one, which needs no answer
-    answered: int = 0  # Pairs answered by a command
-    unanswered: int = 0  # Pairs that got none: overtaken by a newer one, or nothing could or might be sent
-    missed: int = 0  # Sampling periods without a valid pair
-    not_obeyed: int = 0  # Commands that came too late for their period, by the node's own account
-    not_taken: int = 0  # Commands that the interface had no room for; they count as unanswered
-    confirmed: int = 0  # Frames of ours whose echo came back: they were on the bus
-    rejected: int = 0  # Frames rejected by the reception
-    dropped: int = 0  # Frames that the kernel dropped
-    bus_errors: int = 0  # Error frames of the CAN controller
-    clipped: int = 0
-    limited: int = 0  # Commands changed to keep the brake inside its limits
-    returning: int = 0  # Commands that the shield took over to be home in time
-    left: int = 0  # Periods left to the node: what had to be sent lay beyond what may be sent
-    angle_min: float = 0.0
-    angle_max: float = 0.0
-    top_speed: float = 0.0
-    top_current: float = 0.0
-
-    def count_pair(self, sample: SensorSample, missed: int) -> None:
-        """Count a valid pair, and the periods without one just before it."""
-        self.pairs += 1
-        self.missed += missed
-        self.angle_min, self.angle_max = min(self.angle_min, sample.angle), max(self.angle_max, sample.angle)
-        self.top_speed = max(self.top_speed, abs(sample.velocity))
-
-    def count_answer(self, reasons: int, current: float) -> None:
-        """Count a command that was sent, by its :class:`Reason` bits and its current [A]."""
-        self.answered += 1
-        self.clipped += bool(reasons & _CLIPPED)
-        self.limited += bool(reasons & _LIMITED)
-        self.returning += bool(reasons & _RETURNING)
-        self.top_current = max(self.top_current, abs(current))
 
 
 @dataclass(frozen=True)

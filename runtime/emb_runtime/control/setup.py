@@ -15,7 +15,7 @@ from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.control.stop_condition import StopCondition
 from emb_runtime.safety.command_limits import CommandLimits
 from emb_runtime.safety.guard import Guard
-from emb_runtime.safety.shield_design import ShieldLaw, late_step
+from emb_runtime.safety.shield_design import ShieldLaw
 from emb_runtime.safety.state_machine import StateMachine
 
 
@@ -41,11 +41,9 @@ class Setup:
         self.reception = Reception(
             self.layout, bench, lambda frame, why: memory.note(frame.time_ns, "FRAME_REJECTED", why)
         )
-        self.bounds = Bounds(bench)
-        self.conditions = StartConditions(bench, self.layout, self.bounds, anywhere=self.homing)
-        self.monitors = monitors(self.bounds, self.conditions, self.reception, self.guard)
+        self.conditions = StartConditions(bench, self.layout, Bounds(bench), anywhere=self.homing)
+        self.monitors = monitors(self.conditions, self.reception, self.guard)
         self.sensors = Sensors(bench, law, homing=self.homing)
         limit = self.layout.current_within(min(self.limit, bench.limits.current))
         self.command_limits = CommandLimits(limit, bench.guard.slew * bench.timing.sample_time)
-        self.late_step = late_step(law)
         self.estimate = RunningEstimate(bench, self.stop_condition, homing=self.homing)

@@ -16,6 +16,7 @@ from emb_runtime.cli.bus_monitor import (
     ENOUGH_PAIRS,
     BusMonitor,
     BusStatistics,
+    Scatter,
     listen,
 )
 from emb_runtime.cli.options import parser, prepare
@@ -65,9 +66,7 @@ def heard(bench: Bench, layout: Layout) -> BusStatistics:
         pairs=200,
         missing=0,
         period=1e-3,
-        resting=ENOUGH_PAIRS,
-        angle_scatter=bench.noise.angle,
-        velocity_scatter=bench.noise.velocity,
+        scatter=Scatter(ENOUGH_PAIRS, bench.noise.angle, bench.noise.velocity),
         status=status,
         sample=SAMPLE,
     )
@@ -188,9 +187,9 @@ def test_what_only_warns_stands_in_its_line_alone(findings: Findings) -> None:
         (hears(findings, missing=2), "samples", "2 missing"),
         (hears(findings, missing=170), "samples", "170 missing"),
         (hears(findings, rejections={"EMB_Angle": {"CRC": 1}}), "samples", "EMB_Angle: CRC (1)"),
-        (hears(findings, angle_scatter=2.1e-3), "noise at rest", "0.0021 rad"),
-        (hears(findings, velocity_scatter=2.1), "noise at rest", "2.1 rad/s"),
-        (hears(findings, velocity_scatter=math.nan), "noise at rest", "not known"),
+        (hears(findings, scatter=Scatter(200, 2.1e-3, 1.0)), "noise at rest", "0.0021 rad"),
+        (hears(findings, scatter=Scatter(200, 1e-3, 2.1)), "noise at rest", "2.1 rad/s"),
+        (hears(findings, scatter=Scatter(1, math.nan, math.nan)), "noise at rest", "not known"),
         (hears(findings, load=0.72, others=500), "bus load", "72% measured, 500 frames of others"),
         (replace(findings, free=3_000_000), "disk", "3 MiB free"),
         (replace(findings, watchdog=""), "watchdog", "NONE"),
@@ -311,8 +310,8 @@ def test_a_node_that_is_ready_is_heard_just_long_enough(listened: Callable[..., 
     assert heard.period == pytest.approx(1e-3, abs=1e-12)
     assert heard.rates["EMB_Angle"] == pytest.approx(1000.0)
     assert heard.rates["EMB_Status"] == pytest.approx(10.0)
-    assert heard.angle_scatter == pytest.approx(bench.noise.angle, rel=0.2)
-    assert heard.velocity_scatter == pytest.approx(bench.noise.velocity, rel=0.2)
+    assert heard.scatter.angle == pytest.approx(bench.noise.angle, rel=0.2)
+    assert heard.scatter.velocity == pytest.approx(bench.noise.velocity, rel=0.2)
     assert (
         heard.missing,
         heard.others,
@@ -347,8 +346,8 @@ def test_the_scatter_is_that_of_the_samples_since_the_node_is_idle(listened: Cal
         return active._replace(time_ns=frame.time_ns)
 
     heard = listened(change=active_at_first).statistics()
-    assert (heard.pairs, heard.resting) == (ENOUGH_PAIRS, ENOUGH_PAIRS - 120)
-    assert heard.angle_scatter == pytest.approx(statistics.stdev(angles[120:ENOUGH_PAIRS]))
+    assert (heard.pairs, heard.scatter.pairs) == (ENOUGH_PAIRS, ENOUGH_PAIRS - 120)
+    assert heard.scatter.angle == pytest.approx(statistics.stdev(angles[120:ENOUGH_PAIRS]))
 
 
 def test_lost_frames_are_missing_pairs_and_damaged_ones_are_rejections(listened: Callable[..., BusMonitor]) -> None:

@@ -41,7 +41,7 @@ def test_read_only_logs_all_sends_nothing_and_says_what_is_on_the_bus(
     assert frames["EMB_Velocity"] == pytest.approx(700, abs=1)
     assert summary["heard"]["rates"]["EMB_Velocity"] == pytest.approx(1000.0)
     assert summary["heard"]["status"]["stop_reason"] == "NEVER_COMMANDED"
-    assert summary["heard"]["velocity_scatter"] == pytest.approx(1.0, rel=0.2)
+    assert summary["heard"]["scatter"]["velocity"] == pytest.approx(1.0, rel=0.2)
     assert sim.sent == []
     (path,) = tmp_path.glob("run-*-read.mcap")
     log = read_log(path)

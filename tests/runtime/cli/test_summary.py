@@ -18,7 +18,8 @@ from emb_runtime.cli.plan import Plan
 from emb_runtime.cli.preflight import Check, RefusedError
 from emb_runtime.cli.summary import brief, text
 from emb_runtime.config.bench import Bench
-from emb_runtime.control.result import Outcome, RunCounters
+from emb_runtime.control.memory import RunCounters
+from emb_runtime.control.result import Outcome
 from emb_runtime.errors import EXIT_OUTSIDE, BusError, UsageError
 from emb_runtime.log.recorder import RecorderResult
 from emb_runtime.records import NodeState, RunType, SensorSample

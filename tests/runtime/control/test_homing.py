@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from emb_runtime.can.messages import StopReason
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 from emb_runtime.control.actor import Still, homing_steps
+from emb_runtime.control.memory import RunCounters
 from emb_runtime.control.phases import HOME_PAIRS
-from emb_runtime.control.result import TRUSTED_AFTER, Outcome, RunCounters, may_go_home
+from emb_runtime.control.result import TRUSTED_AFTER, Outcome, may_go_home
 from emb_runtime.records import Reason, RunState
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.safety.state_machine import Fault

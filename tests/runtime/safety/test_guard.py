@@ -136,8 +136,8 @@ def test_no_bench_no_limit_and_no_dbc_reaches_beyond_the_ceiling_of_six_ampere(b
     current = command.signal("Current")
     wider = replace(current, minimum=-6.5, maximum=6.5, raw_minimum=-32_500, raw_maximum=32_500)
     command = replace(command, signals=tuple(wider if s is current else s for s in command.signals))
-    encode = generate_codec(command, *_fields(1)["EMB_Command"]).encode
-    wide = replace(load_layout(), command=command, encode_command=encode)
+    write = generate_codec(command, *_fields(1)["EMB_Command"]).write
+    wide = replace(load_layout(), command=command, write_command=write)
     guard = Guard(wide, replace(bench, limits=replace(bench.limits, current=6.5)), bus.send, limit=6.5)
     refused(guard, bus, wide.encode_command(0, 0, 6.0002, True), "beyond 6 A")
     let_out(guard, wide.encode_command(0, 0, 6.0, True), ACTIVE, 100 * MS, 100 * MS)
