@@ -67,7 +67,8 @@ def speeds_of(numbers: Floats, horizon: int) -> Floats:
     shares = np.diff(passed, axis=-1)
     within = shares[..., :-1, :] - shares[..., 1:, :]  # of each period in each level
     speeds = np.einsum("...i,...ik->...k", np.sign(of_levels) * of_levels**2, within)
-    return np.clip(speeds, -1.0, 1.0)  # sums of shares are 1 but for rounding
+    within_limit: Floats = np.clip(speeds, -1.0, 1.0)  # sums of shares are 1 but for rounding
+    return within_limit
 
 
 class Compared:

@@ -52,7 +52,7 @@ def completed(path: Path) -> RunLog | None:
         return None
     heard = json.loads(log.end.get("heard", "null"))
     is_whole = log.complete and log.exit_reason == "DONE"
-    return log if is_whole and (heard is None or heard.get("resting", 0) >= FEWEST) else None
+    return log if is_whole and (heard is None or heard.get("scatter", {}).get("pairs", 0) >= FEWEST) else None
 
 
 def noise_at_rest(log: RunLog, sheet: Bench) -> Noise:
@@ -60,8 +60,8 @@ def noise_at_rest(log: RunLog, sheet: Bench) -> Noise:
 
     A drive's signal in steps that are coarser than the noise does not show it: that counts as the data sheet's.
     """
-    heard = json.loads(log.end["heard"])
-    angle, velocity = max(heard["angle_scatter"], QUIET_ANGLE), max(heard["velocity_scatter"], QUIET_VELOCITY)
+    scatter = json.loads(log.end["heard"])["scatter"]
+    angle, velocity = max(scatter["angle"], QUIET_ANGLE), max(scatter["velocity"], QUIET_VELOCITY)
     angle_step, velocity_step = _steps(log.drive)
     return Noise(
         sheet.noise.angle if angle_step > sheet.noise.angle else angle,
