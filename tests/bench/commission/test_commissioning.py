@@ -221,7 +221,9 @@ def test_a_run_that_was_not_completed_is_done_again_under_another_name(tmp_path:
     assert {path.name for path in tmp_path.glob("*.mcap")} == {"1-listen.mcap", "1-listen-attempt2.mcap"}
 
 
-@pytest.mark.parametrize(("heard", "enough"), [({"scatter": {"pairs": 299}}, False), ({"scatter": {"pairs": 300}}, True), ({}, False)])
+@pytest.mark.parametrize(
+    ("heard", "enough"), [({"scatter": {"pairs": 299}}, False), ({"scatter": {"pairs": 300}}, True), ({}, False)]
+)
 def test_listening_counts_where_the_node_was_idle_for_long_enough_to_know_its_noise(
     heard: dict[str, int], enough: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
