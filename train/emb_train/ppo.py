@@ -102,7 +102,7 @@ class Scaled(nn.Module):
         """Shape [N, size] to the same."""
         return (observation - self.centre) / self.span
 
-    def layers(self, inputs: int, sample_time: float) -> list[nn.Module]:
+    def layers(self, sample_time: float) -> list[nn.Module]:
         """Layers with the same outputs, for observations with the time [s] in place of the step."""
         return [linear(torch.diag(1.0 / self.span), -self.centre / self.span, sample_time)]
 
@@ -117,8 +117,9 @@ class TimeAndEstimate(nn.Module):
     scale: Tensor
     shift: Tensor
 
-    def __init__(self, bench: Bench) -> None:
+    def __init__(self, bench: Bench, inputs: int) -> None:
         super().__init__()
+        self._inputs = inputs
         width, nominal = bench.timing.horizon / STEPS, torch.tensor(nominal_of(bench))
         scale, shift = torch.zeros(STEPS + len(nominal), 1 + len(nominal)), torch.zeros(STEPS + len(nominal))
         scale[:STEPS, 0], shift[:STEPS] = 1.0 / width, -torch.arange(STEPS)
@@ -130,9 +131,9 @@ class TimeAndEstimate(nn.Module):
         """Shape [N, 11] to [N, features]."""
         return torch.tanh(nn.functional.linear(observation[:, SEEN], self.scale, self.shift))
 
-    def layers(self, inputs: int, sample_time: float) -> list[nn.Module]:
+    def layers(self, sample_time: float) -> list[nn.Module]:
         """Layers with the same outputs, for whole observations with the time [s] in place of the step."""
-        weight = torch.zeros(len(self.shift), inputs)
+        weight = torch.zeros(len(self.shift), self._inputs)
         weight[:, SEEN] = self.scale
         return [linear(weight, self.shift, sample_time), nn.Tanh()]
 
@@ -165,8 +166,8 @@ class Actor(nn.Module):
             speed: the action is a target speed, of time and estimate.
         """
         super().__init__()
-        self.inputs, self.speed = inputs, speed
-        features = TimeAndEstimate(bench) if speed else Scaled(bench, inputs)
+        self.speed = speed
+        features = TimeAndEstimate(bench, inputs) if speed else Scaled(bench, inputs)
         self.features: TimeAndEstimate | Scaled = features
         self.log_deviation = nn.Parameter(torch.full((1,), math.log(ppo.initial_deviation)))
         self.log_deviation.requires_grad_(ppo.final_deviation is None)
@@ -234,7 +235,7 @@ class DeployedActor(nn.Module):
         super().__init__()
         self.limit, self.speed = limit, actor.speed
         alike = [nn.Tanh() if isinstance(layer, Tanh) else copy.deepcopy(layer) for layer in actor.layers]
-        self.layers = nn.Sequential(*actor.features.layers(actor.inputs, sample_time), *alike)
+        self.layers = nn.Sequential(*actor.features.layers(sample_time), *alike)
         if actor.speed:
             for values in alike[-1].parameters():
                 values.data *= FINENESS

@@ -372,15 +372,7 @@ def _window(problem: Problem, span: Span) -> Experiment:
     if problem.plant.instruments.observer_bandwidth > 0.0:
         angles = np.concatenate([[experiment.angle], experiment.samples[:, 0]])
         velocity = _slope(angles, begin, problem.bench.timing.sample_time)
-    return replace(
-        experiment.part(begin, end),
-        angle=angle,
-        velocity=velocity,
-        slack=0.0,
-        from_origin=False,
-        assumed=None,
-        places=None,
-    )
+    return replace(experiment.part(begin, end).from_state(angle, velocity), assumed=None)
 
 
 def _slope(angles: Floats, at: int, t_s: float) -> float:

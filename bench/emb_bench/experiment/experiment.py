@@ -141,6 +141,10 @@ class Experiment:
         cut = replace(self, currents=self.currents[:n], samples=self.samples[:n], late=late, assumed=assumed)
         return cut if self.places is None else replace(cut, places=self.places[: len(cut.gaps[1])])
 
+    def from_state(self, angle: float, velocity: float) -> Experiment:
+        """The experiment with another state at sample 0 [rad, rad/s]: nothing known of the old one holds there."""
+        return replace(self, angle=angle, velocity=velocity, slack=0.0, from_origin=False, places=None)
+
     def part(self, begin: int, end: int) -> Experiment:
         """The periods from ``begin`` to ``end``, which start at the sample measured before them."""
         cut = self.until(end)
@@ -149,16 +153,11 @@ class Experiment:
         angle, velocity = self.samples[begin - 1].tolist()
         late, assumed = (None if row is None else row[begin:] for row in (cut.late, cut.assumed))
         return replace(
-            cut,
+            cut.from_state(angle, velocity),
             currents=cut.currents[begin:],
             samples=cut.samples[begin:],
-            angle=angle,
-            velocity=velocity,
-            slack=0.0,
-            from_origin=False,
             late=late,
             assumed=assumed,
-            places=None,
             before=float(self.currents[begin - 1]),
             first=(angle, velocity),
         )
