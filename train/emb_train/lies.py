@@ -68,6 +68,7 @@ LIES: Mapping[str, Callable[[Record], Record]] = {
     "zero at -5 rad": lambda r: r.moved(r.x - 5.0, r.v),
     "current grows by -0.5/s": lambda r: r._replace(u=r.u / (1.0 - 0.5 * r.within)),
     "current swings": lambda r: r._replace(u=r.u / (1.0 + 0.1 * np.sin(SWING * r.within))),
+    "current times 1.05": lambda r: r._replace(u=np.where(r.within > 0.06, r.u / 1.05, r.u)),
     "reported current +0.1 A": lambda r: r._replace(u=r.u + 0.1),
     "friction doubles": lambda r: r.pulled(r.brake.T_c * np.sign(r.v[1:]) * r.within),
     "stiffness halves": lambda r: r.pulled(

@@ -340,6 +340,7 @@ UNEXPLAINED: dict[str, Lie] = {
     "both drift by 5 rad/s": Lie(both=5.0, blind=True),
     "both drift by 5 rad/s with losses": Lie(both=5.0, blind=True, lost=0.05),
     "current times 0.8": Lie(gain=0.8),
+    "current times 1.05": Lie(gain=1.05),
     "current grows by -0.5/s": Lie(gain_rate=-0.5),
     "current swings": Lie(gain_wave=0.1, begin=0.0),
     "reported current -0.4 A": Lie(reported=-0.4, begin=0.0),
