@@ -251,7 +251,7 @@ def test_the_remedy_of_the_first_suspect_gives_a_model_that_fits(plant: str, log
     assert said["model_fits"], names
 
 
-@pytest.mark.parametrize("curve", ["quadratic = -2e-3", "cubic = -5e-5", "quadratic = 3e-3\ncubic = -4e-5"])
+@pytest.mark.parametrize("curve", ["quadratic = -2e-3", "cubic = -5e-5", "quadratic = 3e-3\ncubic = -8e-5"])
 def test_a_clamp_that_becomes_softer_is_estimated_by_the_command_that_names_it(
     curve: str, tmp_path: Path, replay: Replay
 ) -> None:
