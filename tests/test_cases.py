@@ -17,20 +17,10 @@ from emb_runtime.config.bench import load_bench, shipped_bench_text
 from tests.actors import constant_actor
 from tests.bench.simulated_logs import square, write_log
 from tests.conftest import Simulate
+from tools.shipped_files import COMMANDS
 
+PROGRAMS = COMMANDS  # The module whose ``main`` each command calls
 CASES = tomllib.loads((Path(__file__).parent / "cases.toml").read_text(encoding="utf-8"))
-PROGRAMS = {
-    "emb-run": "emb_runtime.cli.main",
-    "emb-gateway": "emb_runtime.cli.gateway",
-    "emb-node": "emb_bench.cli.node",
-    "emb-replay": "emb_bench.cli.replay",
-    "emb-design": "emb_bench.cli.design",
-    "emb-commission": "emb_bench.cli.commission",
-    "emb-train": "emb_train.cli",
-    "emb-export": "emb_export.export",
-    "emb-hil": "emb_bench.hil.cli",
-}
-"""The module whose ``main`` each command calls."""
 
 
 @pytest.fixture(scope="module")

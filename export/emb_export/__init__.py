@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def emb_export() -> int:
-    """``emb-export``; imports the command after the first handler of a Ctrl-C."""
+    """Currents or a network as a policy for emb-run; imported after the first handler of a Ctrl-C."""
     from emb_runtime.system.entry import start  # this package is also a library
 
     return start("emb_export.export", "emb-export: interrupted, nothing written")

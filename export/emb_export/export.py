@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import textwrap
 from pathlib import Path
 
 from emb_bench.config.bench import load_bench
@@ -25,7 +24,7 @@ sequences:
 
 example:
   emb-export chirp:f1=20,amplitude=0.5 -o chirp.onnx
-  emb-export mine.onnx -o actor.onnx && emb-run --iface sim --policy actor.onnx
+  emb-export mine.onnx -o actor.onnx && emb-run --policy actor.onnx
 
 exit codes: 0 done, 2 usage, 5 the network is refused, or the exported file does not compute what it was made of,
 130 Ctrl-C: nothing is written
@@ -34,13 +33,12 @@ exit codes: 0 done, 2 usage, 5 the network is refused, or the exported file does
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    sequences = textwrap.indent(textwrap.fill(", ".join(EXCITATIONS), 116, break_on_hyphens=False), "  ")
+    sequences = f"  {', '.join(EXCITATIONS)}"
     p = Parser(
         prog="emb-export",
         description="Write a policy for emb-run as one ONNX file with its contract, and check that the file computes\n"
         "the same as its source: currents, a design, or a network of your own.",
         epilog=EPILOG.format(sequences=sequences),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument(
         "source",

@@ -24,7 +24,8 @@ MAY_IMPORT = {
 OWN = Path(__file__).relative_to(ROOT)
 OURS = set.union(*MAY_IMPORT.values())
 ROOMS = {
-    "runtime/emb_runtime": "errors records numbers system config can estimator policy log safety drives control cli",
+    "runtime/emb_runtime": "errors records numbers system config can estimator policy log safety drives control cli "
+    "__main__",
     "bench/emb_bench": "config documents numbers options compiled output figures parallel brake sim logs experiment "
     "information excitation recordings hil rerun estimate design export analysis report commission live batch "
     "api cli",

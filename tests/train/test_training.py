@@ -20,6 +20,7 @@ from emb_bench.config.bench import load_bench
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import EXIT_INTERRUPTED, EXIT_USAGE, UsageError
 from emb_runtime.policy.policy import load_policy
+from emb_runtime.system.terminal import DOCUMENT_SCHEMA
 from emb_train.cli import main
 from emb_train.network import network_file
 from emb_train.plan import Found
@@ -33,6 +34,7 @@ from emb_train.training import (
     METRICS,
     ONNX,
     PLAN,
+    Training,
     Validation,
     begin_training,
     hyper_parameters,
@@ -43,12 +45,18 @@ from emb_train.training import (
 from tests.commands import refused
 from tests.train.trainings import HORIZON, ITERATION, make_tiny, short_bench, tiny
 
-FILES = [ONNX, BENCH, CURVE, METRICS, CONFIGURATION]
+FILES = [ONNX, BENCH, "bench.schema.json", CURVE, METRICS, CONFIGURATION]
 
 
 def policy_of(folder: Path) -> dict[str, Any]:
     """What a training's policy says of its origin."""
     return dict(load_policy(folder / ONNX, load_bench(folder / BENCH)).contract.provenance)
+
+
+def configuration_of(folder: Path) -> Training:
+    record = json.loads((folder / CONFIGURATION).read_text())
+    assert record.pop("schema") == DOCUMENT_SCHEMA
+    return training_from(record, "it")
 
 
 def metrics_of(folder: Path) -> list[dict[str, Any]]:
@@ -60,7 +68,7 @@ def test_a_training_writes_all_that_its_result_depends_on_and_keeps_the_best_act
 ) -> None:
     assert sorted(p.name for p in finished.iterdir()) == sorted(FILES)
     metrics, bench = metrics_of(finished), load_bench(finished.parent / "short.toml")
-    assert training_from(json.loads((finished / CONFIGURATION).read_text()), "it") == tiny()
+    assert configuration_of(finished) == tiny()
     assert load_bench(finished / BENCH) == bench
     assert [m["steps"] for m in metrics] == [ITERATION, 2 * ITERATION, 3 * ITERATION]
     scores = [m["score"] for m in metrics]
@@ -108,7 +116,7 @@ def test_hyper_parameters_are_set_by_their_names(
     options += ["--command-delay", "0", "2", "--plant", "exact,observer,stribeck"]
     folder, bench = tmp_path / "run", short_bench(tmp_path)
     assert main(["ppo", "--bench", str(bench), "--output", str(folder), *options]) == 0
-    training = training_from(json.loads((folder / CONFIGURATION).read_text()), "it")
+    training = configuration_of(folder)
     assert load_policy(folder / ONNX, load_bench(bench)).contract.gain == training.conditions.gain == 0.2
     assert (training.conditions.command_delay, training.ppo.envs) == ((0, 2), 12)  # pairs of each of three plants
     assert (training.ppo.hidden, training.ppo.clip, training.ppo.clone_steps) == ((4, 4), 0.1, 2)

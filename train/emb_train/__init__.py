@@ -6,7 +6,7 @@ import sys
 
 
 def emb_train() -> int:
-    """``emb-train``; imports the command after the first handler of a Ctrl-C."""
+    """Training of an excitation, and its evaluation; imported after the first handler of a Ctrl-C."""
     from emb_runtime.system.entry import start  # this package is also a library
 
     return start("emb_train.cli", "emb-train: interrupted")

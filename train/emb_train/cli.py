@@ -16,7 +16,7 @@ from emb_bench.config.plants import EVERY
 from emb_bench.output import progress, replacing
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError, near, needs
-from emb_runtime.system.terminal import Parser, as_json, complain, mention, show
+from emb_runtime.system.terminal import Parser, as_json, complain, json_document, mention, show
 from emb_train.presets import DEFAULT_PRESET, listed, preset_summaries
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ CRITERIA = ("T", "I", "D", "A", "E", "weighted")
 EPILOG = """\
 examples:
   emb-train ppo -o mine && emb-run --iface sim --policy mine/actor.onnx
-  emb-train ppo -o small --steps 2000000 --set hidden=[32,32] --set learning_rate=1e-3
+  emb-train ppo -o small --steps 2000000 --set hidden=[32,32]
   emb-train evaluate mine actor --plant exact,observer
 
 Ctrl-C ends a command and keeps the best result so far.
@@ -36,6 +36,9 @@ Ctrl-C ends a command and keeps the best result so far.
 exit codes: 0 done, 1 training diverged, 2 usage, 5 an ONNX file is refused, 130 interrupted (Ctrl-C)
 """
 PPO_EPILOG = """\
+example:
+  emb-train ppo -o mine && emb-run --iface sim --policy mine/actor.onnx
+
 presets:
 {presets}
 
@@ -45,6 +48,9 @@ lets the actor follow it, and improves that. Ctrl-C ends the training and keeps 
 follows the best plan so far.
 """
 EVALUATE_EPILOG = """\
+example:
+  emb-train evaluate mine actor --plant exact,observer --draws 20
+
 POLICY: the folder of a training, its plan.json, an ONNX file, or 'actor' for the shipped one
 
 criteria: T adds -2 ln of the interval between runs of each parameter that an estimate will have, as emb-replay fim
@@ -64,7 +70,6 @@ def parser() -> argparse.ArgumentParser:
         prog="emb-train",
         description="Learn an excitation for brakes whose parameters are unknown.",
         epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands = p.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, add, summary, epilog in (
@@ -81,8 +86,8 @@ def parser() -> argparse.ArgumentParser:
             EVALUATE_EPILOG,
         ),
     ):
-        said, raw = f"{summary[0].upper()}{summary[1:]}.", argparse.RawDescriptionHelpFormatter
-        add(commands.add_parser(name, help=summary, description=said, epilog=epilog, formatter_class=raw))
+        said = f"{summary[0].upper()}{summary[1:]}."
+        add(commands.add_parser(name, help=summary, description=said, epilog=epilog))
     return p
 
 
@@ -261,7 +266,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
     bench, settings, subjects = prepare(arguments)
     with Console(stderr=True).status("") as status:
         results = evaluate(bench, settings, subjects, status.update)
-    show(as_json(document(settings, results)) if arguments.json else text(settings, results))
+    show(json_document(document(settings, results)) if arguments.json else text(settings, results))
     return EXIT_DONE if len(results) == len(settings.plants) else EXIT_INTERRUPTED
 
 

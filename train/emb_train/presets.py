@@ -7,7 +7,6 @@ its hyper-parameters, the others the project's own.
 from __future__ import annotations
 
 import copy
-import textwrap
 import tomllib
 from collections.abc import Mapping
 from functools import cache
@@ -18,7 +17,6 @@ from emb_runtime.errors import UsageError, near
 
 FILES = resources.files("emb_train")
 DEFAULT_PRESET = "interval"
-WIDTH = 118  # Of a help text's lines
 
 
 @cache
@@ -48,6 +46,5 @@ def preset_record(name: str) -> dict[str, Any]:
 
 def listed(entries: Mapping[str, str]) -> str:
     """Names and what they mean, in lines of a help text."""
-    column = max(map(len, entries)) + 4
-    lines = [f"  {name:<{column - 2}}{meaning}" for name, meaning in entries.items()]
-    return "\n".join(textwrap.fill(line, WIDTH, subsequent_indent=" " * column) for line in lines)
+    column = max(map(len, entries))
+    return "\n".join(f"  {name:<{column}}  {meaning}" for name, meaning in entries.items())

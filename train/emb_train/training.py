@@ -30,10 +30,11 @@ from emb_bench.estimate.expected import NUMBERS, IntervalCriterion
 from emb_bench.figures import COLOURS, GREY, drawn
 from emb_bench.output import make_empty_folder
 from emb_bench.parallel import processes
+from emb_runtime.config.schemas import write_schemas
 from emb_runtime.config.typed import read
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_bytes
-from emb_runtime.system.terminal import as_json
+from emb_runtime.system.terminal import DOCUMENT_SCHEMA, json_document
 from emb_train.closed_loop import BENCH_CONDITIONS, ESTIMATE, SPEED, Conditions, Gain, Positive
 from emb_train.env import (
     DEMANDS,
@@ -67,6 +68,7 @@ class Plan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Parts of the limit, one for each step."""
     ranges: str = ""  # Set of the bench that it was found for
     gain: Gain = BENCH_CONDITIONS.gain  # Of the speed loop
+    schema: int = DOCUMENT_SCHEMA
 
 
 class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -243,7 +245,7 @@ def run_training(
 
 def _note(folder: Path, record: dict[str, Any]) -> None:
     with (folder / METRICS).open("a", encoding="utf-8") as file:
-        file.write(as_json(record) + "\n")
+        file.write(json_document(record) + "\n")
 
 
 def follow_plan(
@@ -271,7 +273,7 @@ def follow_plan(
         speeds = speeds_of(numbers, training.ppo.rollout)
         plan = np.pad(speeds, (0, max(bench.timing.horizon - len(speeds), 0)), "edge").tolist()
         kept = Plan(tuple(plan), training.ranges, training.conditions.gain)
-        (folder / PLAN).write_bytes(msgspec.json.encode(kept) + b"\n")
+        (folder / PLAN).write_text(json_document(msgspec.to_builtins(kept)) + "\n", encoding="utf-8")
         show(None)
         clone(actor, plan, bench, training.ppo, torch.Generator().manual_seed(training.seed))
 
@@ -344,7 +346,9 @@ def begin_training(folder: Path, training: Training, bench: Bench) -> None:
     make_empty_folder(folder)
     try:
         (folder / BENCH).write_text(bench.text, encoding="utf-8")
-        (folder / CONFIGURATION).write_bytes(msgspec.json.format(msgspec.json.encode(training), indent=2) + b"\n")
+        configuration = json_document(msgspec.to_builtins(training))
+        (folder / CONFIGURATION).write_text(msgspec.json.format(configuration, indent=2) + "\n", encoding="utf-8")
+        write_schemas(folder, "bench")
     except OSError as err:
         raise UsageError(f"{folder}: cannot write: {err.strerror}") from err
 

@@ -14,7 +14,7 @@ from emb_bench.config.bench import load_bench
 from emb_bench.logs.log import RunLog
 from emb_bench.output import replacing, require_place, say_if_compiling
 from emb_runtime.errors import LogError, UsageError, needs
-from emb_runtime.system.terminal import as_json
+from emb_runtime.system.terminal import json_document
 
 if TYPE_CHECKING:  # scipy, numba and matplotlib come with the extra [bench]
     from emb_bench.analysis.drift import Earlier
@@ -111,7 +111,7 @@ def report(
         made = Report(study, its, left_out, made_by)
         if criteria is not None:
             made = replace(made, acceptance=test.judge(criteria, study, made.without_part))
-        new_numbers.write_text(as_json(document(made)) + "\n", encoding="utf-8")
+        new_numbers.write_text(json_document(document(made)) + "\n", encoding="utf-8")
         new_page.write_text(html(page_of(made)), encoding="utf-8")
         if asked.junit is not None and made.acceptance is not None:
             with replacing(Path(asked.junit)) as new_cases:

@@ -10,7 +10,7 @@ from emb_bench.config.bench import load_bench
 from emb_bench.documents import to_json
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError, needs
-from emb_runtime.system.terminal import Parser, as_json, complain, is_interactive, mention, show
+from emb_runtime.system.terminal import Parser, complain, is_interactive, json_document, mention, show
 
 EPILOG = """\
 Each step is a run of emb-run behind shield, guard and watchdog, and uses the results of the steps before. Its policy
@@ -42,7 +42,6 @@ def parser() -> argparse.ArgumentParser:
         prog="emb-commission",
         description="Take an unknown brake into service: from a data sheet's ranges to a bench file.",
         epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument("folder", type=folder, metavar="DIR", help="folder for bench files, policies and logs")
     p.add_argument(
@@ -91,7 +90,7 @@ def main(argv: list[str] | None = None) -> int:
         except OSError as err:
             where, expected = err.filename or args.folder, "expected a folder to write in, made if there is none"
             raise UsageError(f"{where}: {err.strerror}; {expected}") from err
-        show(as_json(to_json({"result": "done", **vars(result)})) if args.json else str(result))
+        show(json_document(to_json({"result": "done", **vars(result)})) if args.json else str(result))
     except EmbError as err:
         return complain("emb-commission", err)
     return EXIT_DONE

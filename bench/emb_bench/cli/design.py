@@ -22,12 +22,12 @@ parameter, for its share in T: sums of -2 ln of relative deviations, as emb-repl
 expects them. Of ideal sensors: D log det M, A tr M^-1, E smallest eigenvalue.
 
 example:
-  emb-design -o design.csv && emb-export design.csv -o design.onnx && emb-run --policy design.onnx
+  emb-design -o design.csv
+  emb-export design.csv -o design.onnx && emb-run --policy design.onnx
 
 exit codes:
   0    done; the design keeps the limits on the brake that it was made for
-  2    usage: wrong argument, unreadable bench file, file that cannot be written, no
-       design found
+  2    usage: wrong argument, unreadable bench file, file that cannot be written, no design found
   130  Ctrl-C: the best design so far is written, if there is one
 """
 
@@ -38,7 +38,6 @@ def parser() -> argparse.ArgumentParser:
         prog="emb-design",
         description=f"{summary(api.design.__doc__)}.",
         epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add(p, api.DesignOptions)
     p.add_argument("-o", "--output", type=Path, metavar="FILE", help="file to write: design.csv")

@@ -14,12 +14,12 @@ GARBAGE = 100_000  # New objects after which Python looks for garbage
 
 
 def emb_node() -> int:
-    """``emb-node``: Ctrl-C is how it is ended."""
+    """The simulated brake as a node on a CAN bus; Ctrl-C is how it is ended."""
     return start("emb_bench.cli.node", "", EXIT_DONE)
 
 
 def emb_replay() -> int:
-    """``emb-replay``."""
+    """Evaluation of logs: estimate, report, Fisher information, export."""
     return start("emb_bench.cli.replay", "emb-replay: interrupted", prepare=_for_short_work)
 
 
@@ -34,13 +34,13 @@ def _for_short_work() -> None:
 
 
 def emb_commission() -> int:
-    """``emb-commission``."""
+    """An unknown brake, from a data sheet to a bench file."""
     message = "emb-commission: interrupted while a log was examined; the same command goes on from there"
     return start("emb_bench.cli.commission", message, prepare=_for_short_work)
 
 
 def emb_hil() -> int:
-    """``emb-hil``."""
+    """A command where vcan0 exists, in a kernel of its own if need be."""
     if sys.platform != "linux":
         from emb_runtime.system.terminal import complain
 
@@ -49,5 +49,5 @@ def emb_hil() -> int:
 
 
 def emb_design() -> int:
-    """``emb-design``."""
+    """The current sequence with most information about known parameters."""
     return start("emb_bench.cli.design", "emb-design: interrupted, nothing written")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import signal
 import sys
 from collections.abc import Callable
@@ -21,7 +20,7 @@ from emb_runtime.numbers import plain
 from emb_runtime.safety import watchdog_process
 from emb_runtime.system import realtime
 from emb_runtime.system.clock import Clock
-from emb_runtime.system.terminal import Parser, complain, mention, show
+from emb_runtime.system.terminal import Parser, complain, json_document, mention, show
 
 PRIORITY = watchdog_process.PRIORITY + 5
 """Above all of emb-run, where they share one processor: a real node's clock waits for no computer. So a pair of frames
@@ -46,7 +45,6 @@ def parser() -> argparse.ArgumentParser:
         "only fresh, valid, enabled commands. It brakes in a period without one, and begins a safe stop\n"
         "when commands stop.",
         epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument("--iface", required=True, help="SocketCAN interface (vcan0, can0)")
     p.add_argument("--bench", type=Path, metavar="FILE", help="bench file (default: the shipped drum brake)")
@@ -148,7 +146,7 @@ def _print_summary(node: BrakeNode, skipped: int, as_json: bool) -> None:
     low, high = node.angle_range
     if as_json:
         moved = {"angle_min": low, "angle_max": high, "top_speed": node.top_speed}
-        show(json.dumps({**did, **moved, "angle": node.angle, "velocity": node.velocity}))
+        show(json_document({**did, **moved, "angle": node.angle, "velocity": node.velocity}))
         return
     show(
         f"{line}\nangle {low:.2f}..{high:.2f} rad, top speed {node.top_speed:.1f} rad/s, "

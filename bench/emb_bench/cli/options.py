@@ -13,10 +13,9 @@ from typing import Any, TypeVar
 
 from emb_bench.options import Options, help_of
 from emb_bench.report.text import show
-from emb_runtime.system.terminal import as_json
+from emb_runtime.system.terminal import json_document
 
 Record = TypeVar("Record", bound=Options)
-HELP_WIDTH = 92  # Columns of a description
 
 
 def summary(text: str | None) -> str:
@@ -27,7 +26,7 @@ def summary(text: str | None) -> str:
 def description(text: str | None) -> str:
     """A docstring before its arguments, as paragraphs of ``--help``."""
     before = textwrap.dedent(f"    {text or ''}".partition("Args:\n")[0])
-    return "\n".join(textwrap.fill(part, HELP_WIDTH) for part in before.strip().split("\n\n")) + "\n"
+    return f"{before.strip()}\n"
 
 
 def add(p: argparse.ArgumentParser, record: type[Options]) -> None:
@@ -62,7 +61,7 @@ def add_output_options(p: argparse.ArgumentParser) -> None:
 def answer(args: argparse.Namespace, document: Callable[[], Any], text: Callable[[bool], str]) -> None:
     """Print a result as the options of :func:`add_output_options` say; ``text`` takes True if it is to be verbose."""
     if args.json:
-        show(as_json(document()))
+        show(json_document(document()))
         return
     said = text(args.verbose)
     show(_verdict(said) if args.quiet else said)

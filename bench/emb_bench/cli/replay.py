@@ -193,7 +193,7 @@ COMMANDS: Mapping[str, Command] = {
         "MCAP files of emb-run, of one brake, which are taken together; with a map, recordings of others",
         api.EstimateOptions,
         more=f"{METHODS}\nunknowns for --nuisance, besides the parameters:\n"
-        + "".join(f"  {name:17} {row.about}\n" for name, row in PARAMETERS.items() if row.about),
+        + "".join(f"  {name:17}  {row.about}\n" for name, row in PARAMETERS.items() if row.about),
         strict=f"exit with 1 if {MISFIT}; else with {EXIT_OUTSIDE} if the brake is outside the shield's ranges",
     ),
     "report": Command(
@@ -257,6 +257,12 @@ COMMANDS: Mapping[str, Command] = {
     ),
 }
 """Commands in the order of ``--help``, which is that of their use."""
+EXAMPLES = """\
+examples:
+  emb-replay info run.mcap
+  emb-replay estimate run.mcap
+  emb-replay report run.mcap -o report.html
+"""
 CUT = "\nA cut log (kill -9, full disk) is read as far as it goes, and the missing part is named.\n"
 
 
@@ -271,8 +277,7 @@ def parser(only: str | None = None) -> argparse.ArgumentParser:
     p = Parser(
         prog="emb-replay",
         description="Evaluate logs of emb-run.",
-        epilog=epilog([*MEANINGS]),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=f"{EXAMPLES}\n{epilog([*MEANINGS])}",
     )
     commands = p.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name in COMMANDS if only is None else (only,):
@@ -282,7 +287,6 @@ def parser(only: str | None = None) -> argparse.ArgumentParser:
             help=summary(one.function.__doc__),
             description=f"{description(one.function.__doc__)}\n{one.more}",
             epilog=f"example:\n  emb-replay {name} {one.example}\n\n{epilog(one.codes)}",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         metavar, nargs = ARGUMENTS[one.argument]
         form: dict[str, Any] = {"metavar": metavar, "nargs": nargs, "help": one.argument_help}

@@ -26,7 +26,8 @@ from emb_runtime.safety.shield_design import SLOWEST_OBSERVER, make_law
 
 SHEET, MEASURED = "sheet", "measured"  # Names of the sets of ranges
 WRITTEN = "# Written by emb-commission from a data sheet's bench file. SI units."
-"""First line of a bench file of a commissioning."""
+"""Mark of a bench file of a commissioning."""
+HEAD = f"#:schema ./bench.schema.json\n{WRITTEN}\n# A number without an origin behind it is that file's.\n"
 UNEXPLAINED = 9.0  # Mean square of the residuals, in variances of the noise at rest, from which on nothing is explained
 WIDENED = 0.1  # Share of its value by which a range exceeds the interval: brakes change as they warm and wear
 WIDENED_MISFIT = 0.25  # Share where the residuals contradict every model
@@ -190,4 +191,4 @@ def _text(document: TOMLDocument) -> str:
             origin = f"{own:g} rad by the data sheet; the largest for which a shield covers the ranges"
             _put(document, "limits.angle", [low, highest], origin)
         else:
-            return f"{WRITTEN}\n# A number without an origin behind it is that file's.\n\n{tomlkit.dumps(document)}"
+            return f"{HEAD}\n{tomlkit.dumps(document)}"

@@ -22,6 +22,7 @@ from emb_bench.config.bench import Bench, load_bench, parse_bench
 from emb_bench.logs.log import RunLog
 from emb_runtime.can.messages import bench_identity
 from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.config.schemas import write_schemas
 from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, EmbError, SafetyStopError, UsageError
 from emb_runtime.numbers import between, plain
 from emb_runtime.safety.state_machine import Fault
@@ -146,6 +147,7 @@ class Commissioning:
                     "data sheet that it was made from, or take another folder for this one"
                 )
         path.write_text(text, encoding="utf-8")
+        write_schemas(self._folder, "bench")
         return path
 
     def _log(self, name: str, step: Step, path: Path) -> RunLog:

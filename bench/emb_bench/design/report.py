@@ -27,7 +27,7 @@ from emb_bench.information.symmetric import Floats
 from emb_bench.output import replacing
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_bytes
-from emb_runtime.system.terminal import as_json
+from emb_runtime.system.terminal import json_document
 
 COLUMNS = ("time", "current", "angle", "velocity")
 MAX_DESIGN_BYTES = 64 << 20  # Of a design's file
@@ -147,7 +147,7 @@ class Report:
 
     def json(self) -> str:
         """The metadata as one line; a number that is not finite is null."""
-        return as_json(self.metadata())
+        return json_document(self.metadata())
 
     def columns(self) -> dict[str, Floats]:
         """Rows at the instants 0..n: the current acts from there on; the last one is 0."""

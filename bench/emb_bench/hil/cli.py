@@ -18,7 +18,7 @@ from emb_bench.hil.uml import KernelCommand, state_directory, supervise
 from emb_runtime.errors import EXIT_BUS, EXIT_USAGE, BusError, EmbError, UsageError
 from emb_runtime.system.terminal import Parser, complain, mention
 
-_USAGE = "emb-hil [--host | --uml] [--root] [--slow N] [--boot S] [--memory MB] -- COMMAND..."
+_USAGE = "emb-hil [--host | --uml] [--root] [--slow N] [--boot S] [--memory MB]\n               -- COMMAND..."
 _EPILOG = f"""\
 If vcan0 exists and is up, the command runs on this kernel. Otherwise it runs in a User-Mode Linux kernel, with your
 files, working directory, environment and user; /proc, /sys, /dev, /run and /dev/shm are those of that kernel. Standard
@@ -38,25 +38,25 @@ SLOWEST = 1000
 """Largest ``--slow``. Far beyond it, a program that waits for a time without sleeping would seem to hang."""
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = Parser(
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    p = Parser(
         prog="emb-hil",
         usage=_USAGE,
         description="Run a command where the CAN interface vcan0 exists.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    where = parser.add_mutually_exclusive_group()
+    where = p.add_mutually_exclusive_group()
     where.add_argument("--host", action="store_true", help="use this kernel or fail")
     where.add_argument("--uml", action="store_true", help="always use a User-Mode Linux kernel")
-    parser.add_argument("--root", action="store_true", help="the command is root in the kernel (not on the host)")
-    parser.add_argument("--slow", type=int, default=1, metavar="N",
+    p.add_argument("--root", action="store_true", help="the command is root in the kernel (not on the host)")
+    p.add_argument("--slow", type=int, default=1, metavar="N",
                         help="--uml with a clock N times slower, so that delays of this computer count N times "
                         "less; idle time is skipped (default 1: real time)")  # fmt: skip
-    parser.add_argument("--boot", type=float, default=60.0, metavar="S",
+    p.add_argument("--boot", type=float, default=60.0, metavar="S",
                         help="longest wait for the kernel to come up [s] (default 60)")  # fmt: skip
-    parser.add_argument("--memory", type=int, default=2048, metavar="MB", help="memory of the kernel (default 2048)")
-    return parser
+    p.add_argument("--memory", type=int, default=2048, metavar="MB", help="memory of the kernel (default 2048)")
+    return p
 
 
 def _run(options: argparse.Namespace, command: list[str]) -> int:
@@ -101,12 +101,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             os.open(os.devnull, os.O_RDWR)
     given = list(sys.argv[1:] if arguments is None else arguments)
     mark = given.index("--") if "--" in given else len(given)
-    parser = _parser()
+    known = parser()
     command = given[mark + 1 :]
     try:
-        if not command and (words := parser.parse_known_args(given[:mark])[1]) and not words[0].startswith("-"):
+        if not command and (words := known.parse_known_args(given[:mark])[1]) and not words[0].startswith("-"):
             raise UsageError(f"{words[0]}: write the command after --, as in `emb-hil -- {shlex.join(words)}`")
-        options = parser.parse_args(given[:mark])
+        options = known.parse_args(given[:mark])
         if options.memory < 128:
             raise UsageError("--memory must be at least 128 MB")
         if not 1 <= options.slow <= SLOWEST:

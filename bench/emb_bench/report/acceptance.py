@@ -61,7 +61,7 @@ class Budgets(msgspec.Struct, frozen=True):
     lost: Share | None = None  # Of samples that are not in the log
 
 
-class Criteria(msgspec.Struct, frozen=True):
+class Table(msgspec.Struct, frozen=True):
     """Content of an acceptance file."""
 
     model_fit: bool = True  # The model has to fit the records, and to predict what it was not fitted to
@@ -69,7 +69,6 @@ class Criteria(msgspec.Struct, frozen=True):
     drift: dict[str, Positive] = {}
     """Largest allowed change since an earlier estimate, by parameter: relative, or in the parameter's unit."""
     budgets: Budgets = Budgets()
-    source: str = ""  # Name of the file
 
     def __post_init__(self) -> None:
         """Refuse unknowns that are no brake's, and a share of what has no size."""
@@ -80,6 +79,12 @@ class Criteria(msgspec.Struct, frozen=True):
         for name, one in self.parameters.items():
             if one.interval is None and name in UNITS:
                 raise FieldError(f"parameters.{name}", "expected interval = [low, high]: it has no size to share")
+
+
+class Criteria(Table, frozen=True):
+    """An acceptance file."""
+
+    source: str = ""  # Name of the file
 
 
 @dataclass(frozen=True)
@@ -127,7 +132,7 @@ class Acceptance:
 
 
 class _File(msgspec.Struct, frozen=True):
-    acceptance: Criteria
+    acceptance: Table
 
 
 def read_criteria(path: Path) -> Criteria:
@@ -144,7 +149,7 @@ def read_criteria(path: Path) -> Criteria:
     except (ValueError, RecursionError) as err:
         raise UsageError(f"{source}: expected TOML: {err}") from err
     found = read(_File, content, source, UsageError).acceptance
-    return msgspec.structs.replace(found, source=path.name)
+    return Criteria(**msgspec.structs.asdict(found), source=path.name)
 
 
 def judge(criteria: Criteria, study: Study, without_part: Sequence[str]) -> Acceptance:

@@ -26,9 +26,9 @@ from emb_runtime.system.terminal import (
     Parser,
     StopRequest,
     agreed_to_arm,
-    as_json,
     complain,
     is_interactive,
+    json_document,
     mention,
     show,
 )
@@ -64,7 +64,6 @@ def parser() -> argparse.ArgumentParser:
         prog="emb-gateway",
         description=DESCRIPTION,
         epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument("mapping", type=Path, metavar="FILE", help="mapping file of the drive (TOML)")
     p.add_argument("--drive", required=True, metavar="BUS", help="bus of the drive: can0")
@@ -127,7 +126,9 @@ def _serve(args: argparse.Namespace) -> int:
             gateway.run(stop, lambda: mention(f"{mapping.name}: {done}, node on {args.node}"), arms=not args.listen)
         finally:
             counts = report(gateway.node)
-            show(as_json(counts) if args.json else "\n".join(f"{name}: {value}" for name, value in counts.items()))
+            show(
+                json_document(counts) if args.json else "\n".join(f"{name}: {value}" for name, value in counts.items())
+            )
     if late := gateway.node.times.too_late:
         mention(f"emb-gateway: TOO LATE: {late}")
     return EXIT_CHECK_FAILED if late else EXIT_DONE

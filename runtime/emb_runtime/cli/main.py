@@ -21,10 +21,19 @@ from emb_runtime.cli.plan import Output, Plan, Stage
 from emb_runtime.cli.preflight import Check, RefusedError, table
 from emb_runtime.cli.session import Bus, Console, listen_only
 from emb_runtime.config.bench import shipped_bench_text
+from emb_runtime.config.schemas import write_schemas
 from emb_runtime.errors import EXIT_DONE, BenchFileError, EmbError, UsageError
 from emb_runtime.records import LISTEN_ONLY_LOG
 from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child
-from emb_runtime.system.terminal import StopRequest, agreed_to_arm, as_json, complain, is_interactive, mention, show
+from emb_runtime.system.terminal import (
+    StopRequest,
+    agreed_to_arm,
+    complain,
+    is_interactive,
+    json_document,
+    mention,
+    show,
+)
 
 LISTEN_NS = 50_000_000  # Time between two looks at the keyboard [ns]
 VIEWERS = "emb_runtime.viewers"  # Entry-point group of the modules that show a run: ``live``, and its ``report``
@@ -78,6 +87,8 @@ def main(argv: list[str] | None = None) -> int:
         args = parser().parse_args(argv)
         if args.write_bench is not None:
             return _write_bench(args.write_bench)
+        if args.write_schemas is not None:
+            return _write_schemas(args.write_schemas)
         plan = prepare(args)
         console = Operator(plan, StopRequest())
         try:
@@ -87,7 +98,7 @@ def main(argv: list[str] | None = None) -> int:
                 return _experiment(plan, console)
         except RefusedError as err:
             if plan.output.json:
-                show(as_json(refusal(err, plan.iface)))
+                show(json_document(refusal(err, plan.iface)))
             raise
     except EmbError as err:
         return complain("emb-run", err)
@@ -141,7 +152,7 @@ def _experiment(plan: Plan, console: Console) -> int:
     output = plan.output
     reporter = None if output.report is None else _reporter(output.report)
     document, exit_code = experiment(plan, log_path(output.log), console)
-    text = as_json(document) if output.json else summary.text(document, output.verbose)
+    text = json_document(document) if output.json else summary.text(document, output.verbose)
     show(text.partition("\n")[0] if output.quiet else text)
     if reporter is not None:
         reported = _report(reporter, document["log"], output)
@@ -182,7 +193,7 @@ def _read(plan: Plan, console: Console) -> int:
         document, checks = listen_only(plan, Bus(plan.iface, transport, clock), path, console)
     finally:
         transport.close()
-    show(as_json(document) if plan.output.json else summary.listen_text(document, checks))
+    show(json_document(document) if plan.output.json else summary.listen_text(document, checks))
     exit_code: int = document["exit_code"]
     return exit_code
 
@@ -191,11 +202,20 @@ def _write_bench(path: Path) -> int:
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(shipped_bench_text())
+        write_schemas(path.parent, "bench")
     except FileExistsError as err:
         there = "it is a folder: name a file in it" if path.is_dir() else "there is one already: choose another name"
         raise BenchFileError(f"--write-bench {path}: {there}") from err
     except OSError as err:
         raise BenchFileError(f"--write-bench {path}: {err.strerror}") from err
+    return EXIT_DONE
+
+
+def _write_schemas(folder: Path) -> int:
+    try:
+        write_schemas(folder)
+    except OSError as err:
+        raise UsageError(f"--write-schemas {folder}: expected a folder to write in: {err.strerror}") from err
     return EXIT_DONE
 
 

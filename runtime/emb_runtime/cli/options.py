@@ -34,16 +34,17 @@ a check fails. Results go to standard output, the pre-flight and progress to sta
 
 EPILOG = """\
 with --json:
-  One document on a line: outcome, counts, pre-flight lines, and ways home. A pre-flight that refuses prints a document
-  too; an earlier error prints only a line on standard error.
+  One document on a line: outcome, counts, pre-flight lines, and ways home. \
+A pre-flight that refuses prints a document too; an earlier error prints only \
+a line on standard error.
 
 the simulated bus:
   --iface sim:KEY=VALUE,... with the keys
-    k_m, k_1, T_c, f_v          true parameters of the brake, SI units (default: nominal)
-    plant                       plant of the bench file (default: exact)
-    seed                        seed of the sensor noise (default: 1)
-    angle_noise, velocity_noise standard deviations of the sensors [rad, rad/s] (default: the bench file's)
-    charge                      1: the node also sends the integral of its current (default: 0)
+    k_m, k_1, T_c, f_v           true parameters of the brake, SI units (default: nominal)
+    plant                        plant of the bench file (default: exact)
+    seed                         seed of the sensor noise (default: 1)
+    angle_noise, velocity_noise  standard deviations of the sensors [rad, rad/s] (default: the bench file's)
+    charge                       1: the node also sends the integral of its current (default: 0)
 
 exit codes:
   0  the experiment was completed, and its log is whole; with --read-only: the node is ready
@@ -54,20 +55,28 @@ exit codes:
   5  the policy was refused: damaged, or made for another bench
   6  the experiment was completed, but its log is not whole (disk full, recorder killed)
   8  no single brake explains what the node reported: a sensor, its zero, the reported current, or the drive is wrong
-  9  with --strict: the experiment was completed, but the estimate lies outside the ranges of the bench file: the limits
-     were not guaranteed
+  9  with --strict: the experiment was completed, but the estimate lies outside the ranges of the bench file: the \
+limits were not guaranteed
 
 examples:
-  emb-run --iface sim --json                        the shipped policy on the simulated brake, in lock-step
-  emb-run --iface sim:seed=3,f_v=4e-5               another brake, other noise
-  emb-run --iface sim:plant=stribeck                one of the plants in the bench file (--write-bench shows them)
-  emb-run --iface can0 --read-only --duration 10    first contact with a bench: what is on the bus
-  emb-run --iface can0 --zero                       second: the whole chain, but 0 A
-  emb-run --iface can0 --limit 1 --home             third: at most 1 A, and back to the origin afterwards
-  emb-run --iface can0 --quick                      all four parameters in a tenth of a second
-  emb-run --quick --stop-when k_1=1%,f_v=5%         ends when these two are precise enough
+  emb-run --iface sim --json
+      the shipped policy on the simulated brake, in lock-step
+  emb-run --iface sim:seed=3,f_v=4e-5
+      another brake, other noise
+  emb-run --iface sim:plant=stribeck
+      one of the plants in the bench file (--write-bench shows them)
+  emb-run --iface can0 --read-only --duration 10
+      first contact with a bench: what is on the bus
+  emb-run --iface can0 --zero
+      second: the whole chain, but 0 A
+  emb-run --iface can0 --limit 1 --home
+      third: at most 1 A, and back to the origin afterwards
+  emb-run --iface can0 --quick
+      all four parameters in a tenth of a second
+  emb-run --quick --stop-when k_1=1%,f_v=5%
+      ends when these two are precise enough
   emb-hil --slow 100 -- sh -c 'emb-node --iface vcan0 & emb-run --iface vcan0'
-                                                    where the kernel has no CAN
+      where the kernel has no CAN
 """
 
 
@@ -81,10 +90,9 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = Parser(
         prog="emb-run",
-        usage="emb-run [--iface NAME] [--policy FILE] [--bench FILE] [--log FILE|DIR] [OPTION ...]",
+        usage="emb-run [--iface NAME] [--policy FILE] [--bench FILE] [--log FILE|DIR]\n               [OPTION ...]",
         description=DESCRIPTION,
         epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     # fmt: off
     what = p.add_argument_group("what is run")
@@ -151,7 +159,10 @@ def parser() -> argparse.ArgumentParser:
         help="accept longer time-outs of the bench file than the shipped ones: for a bus without a brake on a computer "
         "that has other work")
 
-    p.add_argument("--write-bench", type=Path, metavar="FILE", help="write the shipped bench file and exit")
+    p.add_argument("--write-bench", type=Path, metavar="FILE",
+        help="write the shipped bench file, and its JSON schema for editors beside it, and exit")
+    p.add_argument("--write-schemas", type=Path, metavar="DIR",
+        help="write the JSON schemas of bench, mapping, map and acceptance files into a folder, and exit")
     # fmt: on
     return p
 

@@ -118,12 +118,12 @@ def _flush() -> None:
 
 
 def emb_gateway() -> int:
-    """``emb-gateway``: until it opens anything, Ctrl-C just ends it."""
+    """A drive with a protocol of its own as a node of emb-run; until it opens anything, Ctrl-C just ends it."""
     return start("emb_runtime.cli.gateway", "", takes_signals=True)
 
 
 def emb_run() -> int:
-    """``emb-run``: until it opens anything, Ctrl-C just ends it."""
+    """One guarded experiment on a brake, logged; until it opens anything, Ctrl-C just ends it."""
     try:
         return start("emb_runtime.cli.main", "", prepare=_choose_core, takes_signals=True)
     except UsageError as err:

@@ -15,8 +15,10 @@ import os
 import re
 import select
 import shlex
+import shutil
 import signal
 import sys
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from typing import Any, NoReturn
@@ -27,6 +29,10 @@ LONGEST_MESSAGE = 1000  # Characters of an error's message
 LONGEST_STRING = 2000  # Characters of a string from outside
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 """Signals with which an operator ends a command, those of them that this operating system has."""
+
+DOCUMENT_SCHEMA = 1
+"""Form of every JSON document that a command prints or writes; it rises when a key goes, or means something else."""
+HELP_WIDTH = 80  # Columns of a help, at most
 
 _NOT_ASCII = re.compile("[^ -~]")
 
@@ -138,12 +144,35 @@ NUMBERS: Mapping[Any, str] = {int: "a whole number", float: "a number, with a po
 """Types of an option that takes a number, and what to write."""
 
 
+def filled(text: str, width: int) -> str:
+    """A text of at most this width: paragraphs are filled, an indented line goes on below its last column."""
+    lines: list[str] = []
+    for indented, part in itertools.groupby(text.split("\n"), lambda line: line[:1] in ("", " ")):
+        for row in part if indented else [" ".join(part)]:
+            *_, column = re.finditer(r"^ *|\S {2,}", row)
+            below = " " * column.end()
+            lines += textwrap.wrap(
+                row, width, subsequent_indent=below, break_long_words=False, break_on_hyphens=False
+            ) or [""]
+    return "\n".join(lines)
+
+
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """A help that fits into a terminal, and is no wider in a wide one."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, width=min(shutil.get_terminal_size().columns, HELP_WIDTH) - 2)
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return filled(text, width)
+
+
 class Parser(argparse.ArgumentParser):
     """A command line whose wrong use is one line, with the option or the command that may have been meant."""
 
     def __init__(self, **options: Any) -> None:
         """A parser that takes no option by the beginning of its name, and tells the version."""
-        super().__init__(allow_abbrev=False, **options)
+        super().__init__(allow_abbrev=False, formatter_class=_Help, **options)
         version = f"{self.prog.partition(' ')[0]} {metadata.version('emb-excite')}"
         self.add_argument("--version", action="version", version=version)
 
@@ -195,8 +224,13 @@ def complain(command: str, err: EmbError) -> int:
     return err.exit_code
 
 
+def json_document(document: Mapping[str, Any]) -> str:
+    """A result as one line of JSON, which begins with the number of its form."""
+    return as_json({"schema": DOCUMENT_SCHEMA, **document})
+
+
 def as_json(document: Any) -> str:
-    """A document as one line of JSON; a number that is not finite is null, for JSON has no such numbers."""
+    """A value as one line of JSON; a number that is not finite is null, for JSON has no such numbers."""
     return json.dumps(_finite(document), allow_nan=False)
 
 

@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -320,7 +321,7 @@ def test_the_help_of_a_command_has_its_own_exit_codes(capsys: pytest.CaptureFixt
             main([name, "--help"])
         assert left.value.code == 0
         end = capsys.readouterr().out.partition("exit codes:\n")[2].partition("\n\n")[0]
-        assert [int(line.split()[0]) for line in end.splitlines()] == sorted(command.codes)
+        assert [*map(int, re.findall(r"^  (\d+) ", end, re.MULTILINE))] == sorted(command.codes)
 
 
 def test_a_reader_who_leaves_early_is_no_error(path: Path) -> None:
