@@ -92,5 +92,11 @@ class LogError(EmbError):
     exit_code = EXIT_LOG
 
 
+class CheckFailedError(EmbError):
+    """What a command would make has not passed the check that comes before."""
+
+    exit_code = EXIT_CHECK_FAILED
+
+
 class FrameError(EmbError, ValueError):
     """A value does not fit its CAN signal, or a frame does not fit its message."""

@@ -27,7 +27,7 @@ ROOMS = {
     "runtime/emb_runtime": "errors records numbers system config can estimator policy log safety drives control cli "
     "__main__",
     "bench/emb_bench": "config documents numbers options compiled output figures parallel brake sim logs experiment "
-    "information excitation recordings hil rerun estimate design export analysis report commission live batch "
+    "information excitation recordings hil rerun estimate design analysis export report commission live batch "
     "api cli",
     "train/emb_train": "presets rewards closed_loop intervals lies env play ppo plan training network optimum evaluate "
     "cli",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -132,6 +132,19 @@ class EstimateOptions(SearchOptions):
             raise UsageError(f"--known {', '.join(unasked)}: expected one of {', '.join(asked.names)}")
         asked = freed(asked, bench)
         return with_systematic(asked, bench, plant) if self.systematic == "bench" else asked
+
+
+@dataclass(frozen=True, eq=False)
+class ExportOptions(EstimateOptions):
+    """Options of an export; those of the estimate are for a model."""
+
+    topic: str | None = option(None, "of a table (default: /cycle, the control cycles)", "TOPIC")
+    theta: str | Path | Mapping[str, float] | None = option(
+        None, "parameters of a model, as for fim (default: those of the estimate, with intervals)", "THETA"
+    )
+    draw: int | None = option(
+        None, "a model whose parameters are drawn from the joint distribution of the estimate", "SEED", kind=int, least=0
+    )
 
 
 @dataclass(frozen=True, eq=False)

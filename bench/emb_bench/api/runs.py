@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 from weakref import WeakKeyDictionary, finalize
 
 from numpy.typing import NDArray
 
+from emb_bench.analysis.options import EstimateOptions, ExportOptions
 from emb_bench.api.arguments import AnyRun, listed, opened, options_of
 from emb_bench.figures import for_notebook
 from emb_bench.logs.log import RunLog, read_log
-from emb_bench.options import Options, option
 from emb_runtime.errors import near, needs
 
 if TYPE_CHECKING:  # matplotlib and pyarrow come with the extra [bench]
@@ -143,24 +143,17 @@ def draw(run: AnyRun, axes: Sequence[Axes]) -> None:
     draw_on(opened(run), axes)
 
 
-@dataclass(frozen=True, eq=False)
-class ExportOptions(Options):
-    """Options of an export."""
-
-    topic: str | None = option(None, "of a table (default: /cycle, the control cycles)", "TOPIC")
-    theta: str | Path | Mapping[str, float] | None = option(
-        None, "parameters of a model, as for fim (default: log, and nominal where it has no estimate)", "THETA"
-    )
-
-
 def export(run: AnyRun, output: str | Path, options: ExportOptions | None = None, **more: Any) -> str:
-    """A part of a run for another tool: a picture, one topic as a table with units, or the brake as a MuJoCo model.
+    """A part of a run for another tool: a picture, one topic as a table with units, or the identified brake as a model.
 
-    The frames on the bus go to BLF, ASC and others by can_logconvert RUN FILE.
+    Models are an FMU (FMI 3.0, co-simulation), C source, a calibration file (DCM 2.0) and MJCF of MuJoCo. Their
+    parameters are those of the estimate, which has to fit, each with its 95 % interval. The frames on the bus go to BLF,
+    ASC and others by can_logconvert RUN FILE.
 
     Args:
-        run: MCAP file of emb-run.
-        output: file to write: a picture (.png, .svg, .pdf), a table (.csv, .parquet) or a model (.xml) by its ending.
+        run: MCAP file of emb-run; for a model with a map, a recording of others.
+        output: file to write: a picture (.png, .svg, .pdf), a table (.csv, .parquet) or a model (.fmu, .c, .dcm, .xml)
+            by its ending.
         options: a record of options.
         more: its fields as keywords: ``export(run, "rows.csv", topic="/safety")``.
 
@@ -170,11 +163,15 @@ def export(run: AnyRun, output: str | Path, options: ExportOptions | None = None
     Raises:
         UsageError: an argument is wrong, a library is missing, or the file cannot be written.
         LogError: the topic cannot be decoded, or the run has no control cycles.
+        CheckFailedError: the model of the estimate does not fit, or a parameter is not identified.
     """
+    from emb_bench.api.estimates import estimate
     from emb_bench.export.export import write
 
     asked = options_of("export", ExportOptions, options, more)
-    return write(opened(run), Path(output), asked.topic, asked.theta)
+    log = opened(run, asked.map)
+    of_estimate = {one.name: getattr(asked, one.name) for one in fields(EstimateOptions)}
+    return write(log, Path(output), asked, lambda: estimate(log, EstimateOptions(**of_estimate)))
 
 
 def rerun(run: AnyRun) -> Rerun:

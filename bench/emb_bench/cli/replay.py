@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from emb_bench import api
+from emb_bench.api.arguments import opened
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.cli.live import LiveOptions, live
 from emb_bench.cli.options import add, add_output_options, answer, description, given, summary
@@ -92,8 +93,9 @@ def _report(args: argparse.Namespace) -> int:
 
 
 def _export(args: argparse.Namespace) -> int:
-    log = api.open_run(args.run)
-    holds = api.export(log, args.output, given(args, api.ExportOptions))
+    asked = given(args, api.ExportOptions)
+    log = opened(args.run, asked.map)
+    holds = api.export(log, args.output, asked)
     warning = f"WARNING: {log.missing}\n" if log.missing else ""
     document = {"log": str(args.run), "file": str(args.output), "holds": holds, "missing": log.missing}
     answer(args, lambda: document, lambda _: f"{warning}{args.output}: {holds}")
@@ -230,10 +232,13 @@ COMMANDS: Mapping[str, Command] = {
     "export": Command(
         api.export,
         _export,
-        OF_A_LOG,
-        "run.mcap -o cycles.parquet --topic /cycle",
+        CHECKED,
+        "run.mcap -o brake.fmu",
+        argument_help="MCAP file of emb-run; for a model with a map, a recording of others",
         options=api.ExportOptions,
-        output="file to write: a picture (.png, .svg, .pdf), a table (.csv, .parquet) or a model (.xml) by its ending",
+        output="file to write: a picture (.png, .svg, .pdf), a table (.csv, .parquet) or a model (.fmu, .c, .dcm, "
+        ".xml) by its ending",
+        more=UNKNOWNS,
     ),
     "campaign": Command(
         api.campaign,

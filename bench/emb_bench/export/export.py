@@ -1,14 +1,20 @@
-"""A topic of a log as a table, a picture of the run, or its brake as a model of MuJoCo."""
+"""A topic of a log as a table, a picture of the run, or its brake as a model."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
+from emb_bench.analysis.options import ExportOptions
+from emb_bench.export.c_source import write_c
+from emb_bench.export.dcm import write_dcm
+from emb_bench.export.fmu import write_fmu
+from emb_bench.export.identified import identified
 from emb_bench.export.mjcf import write_mjcf
 from emb_bench.export.picture import ENDINGS as PICTURES
 from emb_bench.export.picture import draw_run
@@ -16,6 +22,9 @@ from emb_bench.logs.log import UNIX_TIME, RunLog
 from emb_bench.logs.mcap_file import Column
 from emb_bench.output import replacing, require_place, text_cells
 from emb_runtime.errors import UsageError, needs
+
+if TYPE_CHECKING:
+    from emb_bench.analysis.study import Study
 
 
 def arrow_batches(log: RunLog, topic: str) -> tuple[Any, Iterator[Any]]:
@@ -88,19 +97,22 @@ def write_csv(log: RunLog, topic: str, path: Path) -> str:
 
 
 TABLES = {".csv": write_csv, ".parquet": write_parquet}
-MODEL = (".xml", ".mjcf")
-FORMATS = (*PICTURES, *TABLES, *MODEL)  # Endings of what is written
+MODELS = {".fmu": write_fmu, ".c": write_c, ".dcm": write_dcm, ".xml": write_mjcf, ".mjcf": write_mjcf}
+FORMATS = (*PICTURES, *TABLES, *MODELS)  # Endings of what is written
 CYCLE = "/cycle"
 
 
-def write(log: RunLog, path: Path, topic: str | None, theta: str | Path | Mapping[str, float] | None) -> str:
-    """Write a picture, a topic as a table, or the brake as a model, by the ending of the file; says what it holds."""
+def write(log: RunLog, path: Path, asked: ExportOptions, estimate: Callable[[], Study]) -> str:
+    """Write a picture, a topic as a table, or the brake as a model, by the ending of the file; says what it holds.
+
+    The ``estimate`` is made for a model that has no other parameters.
+    """
     ending = path.suffix.lower()
     require_place("--output", path, FORMATS)
-    if topic is not None and ending not in TABLES:
-        raise UsageError(f"--topic: expected with a file that ends in {' or '.join(TABLES)}, got {path}")
-    if theta is not None and ending not in MODEL:
-        raise UsageError(f"--theta: expected with a file that ends in {' or '.join(MODEL)}, got {path}")
-    if ending in PICTURES:
-        return draw_run(log, path)
-    return TABLES[ending](log, topic or CYCLE, path) if ending in TABLES else write_mjcf(log, theta, path)
+    for one in fields(asked):
+        endings = TABLES if one.name == "topic" else MODELS
+        if getattr(asked, one.name) != one.default and ending not in endings:
+            raise UsageError(f"--{one.name}: expected with a file that ends in {' or '.join(endings)}, got {path}")
+    if ending in MODELS:
+        return MODELS[ending](identified(log, asked, estimate), path)
+    return TABLES[ending](log, asked.topic or CYCLE, path) if ending in TABLES else draw_run(log, path)

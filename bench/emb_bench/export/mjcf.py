@@ -7,11 +7,9 @@ friction loss is a soft constraint that acts from step to step: a reversal is as
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
-from emb_bench.experiment.theta import read_theta
-from emb_bench.logs.log import RunLog
+from emb_bench.export.identified import Identified
 from emb_bench.output import replacing
 from emb_runtime.config.bench import Bench, BrakeParameters
 
@@ -55,10 +53,10 @@ def mjcf(bench: Bench, brake: BrakeParameters) -> str:
     )
 
 
-def write_mjcf(log: RunLog, theta: str | Path | Mapping[str, float] | None, path: Path) -> str:
-    """Write the brake of a log; says which parameters it has, of :func:`emb_bench.experiment.theta.read_theta`."""
-    name, brake, _ = read_theta(theta, log, log.bench)
-    text = mjcf(log.bench, brake)
+def write_mjcf(found: Identified, path: Path) -> str:
+    """Write the model of a brake; says which parameters it has, and which features it lacks."""
+    text = mjcf(found.bench, found.brake)
     with replacing(path) as beside:
         beside.write_text(text, encoding="utf-8")
-    return f"a MuJoCo model, parameters: {name}"
+    lacks = f", without {', '.join(found.features)}" if found.features else ""
+    return f"a MuJoCo model{lacks}, parameters: {found.source}"

@@ -1,0 +1,27 @@
+
+void brake_outputs(brake *b) {
+  b->angle = b->x1 + b->contact;
+  b->velocity = b->x2;
+  b->clamping_force = force(b);
+  const double most = largest_holding(b), pull = b->k_m * b->i - b->gamma * b->clamping_force;
+  b->friction_torque = b->x2 != 0.0 ? sliding(b) : fmax(-most, fmin(pull, most));
+}
+
+void brake_start(brake *b) {
+  b->x1 = b->x1_0 - b->contact;
+  b->x2 = b->x2_0;
+  b->w = b->i = b->current = 0.0;
+  brake_outputs(b);
+}
+
+void brake_init(brake *b) {
+@values@
+  brake_start(b);
+}
+
+void brake_step(brake *b, double current, double dt) {
+  b->current = current;
+  advance(b, current, dt);
+  brake_outputs(b);
+}
+#endif

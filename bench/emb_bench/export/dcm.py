@@ -1,0 +1,25 @@
+"""An identified brake as a calibration file: DCM 2.0, a scalar (``FESTWERT``) for each parameter."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from emb_bench.export.identified import Identified
+from emb_bench.output import replacing
+
+
+def dcm(found: Identified) -> str:
+    """The text of the file; the 95 % interval of a parameter is in a comment."""
+    lines = ["KONSERVIERUNG_FORMAT 2.0", "* Made by emb-excite", f"* parameters: {found.source}"]
+    for one in found.parameters():
+        lines += ["", f"FESTWERT {one.name}", f'   LANGNAME "{one.about}"', f'   EINHEIT_W "{one.unit}"']
+        lines += [f"   WERT {one.value!r}", f"* {one.known}", "END"]
+    return "\n".join([*lines, ""])
+
+
+def write_dcm(found: Identified, path: Path) -> str:
+    """Write the calibration file; says which parameters it has."""
+    text = dcm(found).encode("latin-1", "replace")  # the encoding of the format
+    with replacing(path) as beside:
+        beside.write_bytes(text)
+    return f"a calibration file, parameters: {found.source}"
