@@ -93,7 +93,7 @@ class LogError(EmbError):
 
 
 class CheckFailedError(EmbError):
-    """What a command would make has not passed the check that comes before."""
+    """A check that comes before a result was not passed: nothing is written."""
 
     exit_code = EXIT_CHECK_FAILED
 

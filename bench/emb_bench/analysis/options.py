@@ -143,7 +143,11 @@ class ExportOptions(EstimateOptions):
         None, "parameters of a model, as for fim (default: those of the estimate, with intervals)", "THETA"
     )
     draw: int | None = option(
-        None, "a model whose parameters are drawn from the joint distribution of the estimate", "SEED", kind=int, least=0
+        None,
+        "a model whose parameters are drawn from the joint distribution of the estimate",
+        "SEED",
+        kind=int,
+        least=0,
     )
 
 

@@ -147,8 +147,8 @@ def export(run: AnyRun, output: str | Path, options: ExportOptions | None = None
     """A part of a run for another tool: a picture, one topic as a table with units, or the identified brake as a model.
 
     Models are an FMU (FMI 3.0, co-simulation), C source, a calibration file (DCM 2.0) and MJCF of MuJoCo. Their
-    parameters are those of the estimate, which has to fit, each with its 95 % interval. The frames on the bus go to BLF,
-    ASC and others by can_logconvert RUN FILE.
+    parameters are those of the estimate, which has to fit, each with its 95 % interval. The frames on the bus go to
+    BLF, ASC and others by can_logconvert RUN FILE.
 
     Args:
         run: MCAP file of emb-run; for a model with a map, a recording of others.

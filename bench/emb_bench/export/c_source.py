@@ -31,8 +31,8 @@ def c_source(found: Identified) -> str:
     """The C of a brake: a struct, and functions that start it and step it."""
     parameters = found.parameters()
     about = textwrap.fill(
-        f"Made by emb-excite; parameters: {found.source}. Double precision, SI units; a step solves sticking and contact "
-        "exactly. Where this file is only declared: #define BRAKE_DECLARATIONS_ONLY.",
+        f"Made by emb-excite; parameters: {found.source}. Double precision, SI units; a step solves sticking and "
+        "contact exactly. Where this file is only declared: #define BRAKE_DECLARATIONS_ONLY.",
         width=112,
     ).replace("*/", "* /")
     names = textwrap.fill(", ".join(one.name for one in parameters), 104, subsequent_indent="      ")

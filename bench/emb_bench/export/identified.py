@@ -83,14 +83,17 @@ class Identified:
 
     @property
     def features(self) -> tuple[str, ...]:
-        """Names of the features beyond the thesis's equations."""
-        usual = Mechanics()._asdict()
-        return tuple(n for n, value in self.mechanics._asdict().items() if value != usual[n] and n != "tolerance")
+        """Names of what it has beyond the thesis's equations."""
+        usual = Mechanics()._asdict() | {"contact": 0.0, "tolerance": self.mechanics.tolerance}
+        values = self.mechanics._asdict() | {"contact": self.contact}
+        return tuple(name for name, value in values.items() if value != usual[name])
 
     def parameters(self) -> list[Parameter]:
         """All parameters of the equations that the brake is solved by, and its start at rest at the origin."""
         if self.mechanics.solver == EULER:
-            raise UsageError(f"expected a plant that is solved exactly, and this one is stepped: --model {DEFAULT_PLANT}")
+            raise UsageError(
+                f"expected a plant that is solved exactly, and this one is stepped: --model {DEFAULT_PLANT}"
+            )
         of_plant = {n: v for n, v in self.mechanics._asdict().items() if (n == "viscous_asymmetry") is self.plain}
         values = self.brake._asdict() | of_plant | dict.fromkeys(START, 0.0) | {"contact": self.contact}
         found = []

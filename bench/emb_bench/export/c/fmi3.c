@@ -69,8 +69,7 @@ EXPORT void *NAME(fmi3InstantiateScheduledExecution)(text a, text b, text c, _Bo
 EXPORT void NAME(fmi3FreeInstance)(instance *c) { free(c); }
 
 FMI(fmi3EnterInitializationMode)(instance *c, _Bool given, double tolerance, double start, _Bool ends, double stop) {
-  c->time = start;
-  return OK;
+  return c->time = start, OK;
 }
 FMI(fmi3ExitInitializationMode)(instance *c) { return c->running = 1, OK; }
 FMI(fmi3Terminate)(instance *c) { return c ? OK : ERROR; }
@@ -83,7 +82,6 @@ FMI(fmi3GetFloat64)(instance *c, const reference v[], size_t n, double x[], size
   }
   return OK;
 }
-
 FMI(fmi3SetFloat64)(instance *c, const reference v[], size_t n, const double x[], size_t m) {
   for (size_t k = 0; k < n; k++) {
     if (v[k] < 1 || v[k] > CURRENT || n != m) return refuse(c, "neither a parameter nor the current");
@@ -96,7 +94,6 @@ FMI(fmi3SetFloat64)(instance *c, const reference v[], size_t n, const double x[]
   c->b.current = current;
   return OK;
 }
-
 FMI(fmi3DoStep)(instance *c, double point, double size, _Bool final, _Bool *event, _Bool *ends, _Bool *early,
                 double *last) {
   if (!(size > 0.0 && isfinite(size))) return refuse(c, "expected a step longer than 0 s");
@@ -105,13 +102,11 @@ FMI(fmi3DoStep)(instance *c, double point, double size, _Bool final, _Bool *even
   *event = *ends = *early = 0;
   return OK;
 }
-
 FMI(fmi3GetFMUState)(instance *c, void **kept) {
   if (!*kept && !(*kept = malloc(sizeof *c))) return refuse(c, "no memory");
   memcpy(*kept, c, sizeof *c);
   return OK;
 }
-
 FMI(fmi3SetFMUState)(instance *c, void *kept) { return memcpy(c, kept, sizeof *c), OK; }
 FMI(fmi3FreeFMUState)(instance *c, void **kept) { return free(*kept), *kept = NULL, OK; }
 

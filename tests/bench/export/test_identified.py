@@ -1,0 +1,294 @@
+"""The identified brake as FMU, as C and as calibration file, against the bench's own simulation and other readers."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import shutil
+import subprocess
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import fmpy
+import numpy as np
+import pytest
+from fmpy.fmi1 import FMICallException
+from fmpy.fmi3 import FMU3Slave
+from fmpy.validation import validate_fmu
+
+from emb_bench import api
+from emb_bench.analysis.study import Study
+from emb_bench.brake.forces import clamping_force, decay, sliding_torque, static_torque, travel
+from emb_bench.brake.motion import Floats
+from emb_bench.config.bench import load_bench
+from emb_bench.config.plants import Mechanics
+from emb_bench.estimate.records import Unknown
+from emb_bench.experiment.simulate import Theta
+from emb_bench.export.c_source import OUTPUTS, c_source
+from emb_bench.export.fmu import write_fmu
+from emb_bench.export.identified import Identified, drawn
+from emb_bench.sim.open_loop import held, march, trajectory
+from emb_runtime.config.bench import PARAMETER_NAMES
+
+from tests.bench.conftest import Replay  # isort: skip
+
+BENCH = load_bench()
+T_S = BENCH.timing.sample_time
+FEATURES = {
+    "exact": Mechanics(),
+    "viscous asymmetry": Mechanics(viscous_asymmetry=0.3),
+    "play": Mechanics(play=0.5, quadratic=1e-3, f_l=2e-6, break_away=1.2, stribeck_velocity=20.0),
+    "hysteresis behind a lag": Mechanics(
+        break_away=1.3,
+        stribeck_velocity=9.0,
+        stribeck_exponent=1.5,
+        current_lag=0.002,
+        hysteresis=0.2,
+        hysteresis_travel=0.5,
+    ),
+}
+
+
+def profile(seed: int, periods: int = 400) -> Floats:
+    """Currents that reverse, hold and release the brake; half of them are too small to move it from rest."""
+    rng = np.random.default_rng(seed)
+    levels = rng.uniform(-4.0, 4.0, periods) * rng.choice([0.1, 1.0], periods)
+    return np.repeat(levels, rng.integers(1, 60, periods))[:periods]
+
+
+def expected(found: Identified, currents: Floats, brake: Any = None) -> Floats:
+    """States after each period by the bench's simulation."""
+    x, chosen, s = Theta(brake or found.brake, contact=found.contact).begin(0.0, ())
+    states, _ = trajectory(march, found.mechanics, brake or found.brake, held(currents, T_S), chosen, x, s)
+    return states[1:] + np.array([found.contact, 0.0, 0.0, 0.0])
+
+
+def simulated(path: Path, currents: Floats, **start: float) -> Any:
+    """Outputs after each period by FMPy."""
+    rows = [(T_S * k, current) for k, current in enumerate(currents)]
+    found = fmpy.simulate_fmu(
+        str(path),
+        step_size=T_S,
+        output_interval=T_S,
+        stop_time=T_S * len(currents),
+        start_values=start,
+        input=np.array(rows, [("time", float), ("current", float)]),
+        output=list(OUTPUTS),
+    )
+    return found[1 : len(currents) + 1]
+
+
+def assert_same(found: Any, states: Floats) -> None:
+    for column, name in enumerate(("angle", "velocity")):
+        assert np.abs(found[name] - states[:, column]).max() < 1e-6 * np.ptp(states[:, column])
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("identified") / "run.mcap"
+    api.simulate(path, seed=1)
+    return path
+
+
+@pytest.fixture(scope="module")
+def study(log: Path) -> Study:
+    return api.estimate(log)
+
+
+@pytest.mark.parametrize("name", FEATURES)
+def test_an_fmu_moves_as_the_bench_simulates(name: str, tmp_path: Path) -> None:
+    m, path = FEATURES[name], tmp_path / "brake.fmu"
+    found = Identified("test", BENCH, BENCH.brake, m, contact=1.5)
+    assert "binaries/" in write_fmu(found, path)
+    assert validate_fmu(str(path)) == []
+    at_rest = 0
+    for seed in range(3):
+        currents = profile(seed)
+        states, moved = expected(found, currents), simulated(path, currents)
+        assert_same(moved, states)
+        at_rest += int((moved["velocity"] == 0.0).sum())
+        for (x1, v, w, i), row in zip(states, moved, strict=True):
+            p, x1 = found.brake, float(x1) - found.contact
+            load = clamping_force(m, p, x1, w) if travel(m, x1, w) > 0.0 else 0.0
+            assert row["clamping_force"] == pytest.approx(load, rel=1e-6, abs=1e-6)
+            moving = sliding_torque(m, p, abs(v), load, decay(m, v)) * np.sign(v)
+            moving += m.viscous_asymmetry * p.f_v * abs(v)
+            most = static_torque(m, p, load)
+            friction = moving if v != 0.0 else np.clip(p.k_m * i - p.gamma * load, -most, most)
+            assert row["friction_torque"] == pytest.approx(friction, rel=1e-6, abs=1e-9)
+    assert at_rest > 50
+
+
+def test_every_parameter_of_an_fmu_can_be_set(tmp_path: Path) -> None:
+    found = Identified("test", BENCH, BENCH.brake, FEATURES["play"])
+    write_fmu(found, tmp_path / "brake.fmu")
+    other = found.brake._replace(**{name: 1.2 * value for name, value in found.brake._asdict().items()})
+    changed = Identified("test", BENCH, other, Mechanics(cubic=1e-5, play=0.3))
+    start = {one.name: one.value for one in changed.parameters() if one.name in {p.name for p in found.parameters()}}
+    assert len(start) == len(found.parameters())
+    assert_same(simulated(tmp_path / "brake.fmu", profile(7), **start), expected(changed, profile(7)))
+
+
+def test_an_fmu_has_all_functions_of_fmi_3_in_at_most_400_lines(tmp_path: Path) -> None:
+    header = (Path(fmpy.__file__).parent / "c-code/fmi3Functions.h").read_text(encoding="utf-8")
+    names = set(re.findall(r"FMI3_Export (fmi3\w+)TYPE", header))
+    assert len(names) > 70
+    for name, mechanics in FEATURES.items():
+        write_fmu(Identified("test", BENCH, BENCH.brake, mechanics), tmp_path / "brake.fmu")
+        folder = Path(fmpy.extract(str(tmp_path / "brake.fmu"), str(tmp_path / name)))
+        library = ctypes.CDLL(str(next(folder.glob("binaries/*/brake.so"))))
+        assert not [name for name in names if not hasattr(library, name)]
+        sources = sorted((folder / "sources").glob("*.c"))
+        assert sum(len(path.read_text(encoding="utf-8").splitlines()) for path in sources) <= 400
+
+
+def test_an_importer_can_step_back_reset_and_is_refused_what_is_no_step(tmp_path: Path) -> None:
+    write_fmu(Identified("test", BENCH, BENCH.brake, Mechanics()), tmp_path / "brake.fmu")
+    model = fmpy.read_model_description(tmp_path / "brake.fmu")
+    unpacked, keys = fmpy.extract(str(tmp_path / "brake.fmu")), {v.name: v.valueReference for v in model.modelVariables}
+    fmu = FMU3Slave(guid=model.guid, unzipDirectory=unpacked, modelIdentifier="brake", instanceName="test")
+    fmu.instantiate()
+
+    def begun() -> None:
+        fmu.enterInitializationMode()
+        fmu.exitInitializationMode()
+        fmu.setFloat64([keys["current"]], [3.0])
+
+    def stepped() -> list[float]:
+        fmu.doStep(currentCommunicationPoint=0.0, communicationStepSize=0.01)
+        found: list[float] = fmu.getFloat64([keys["angle"], keys["velocity"]])
+        return found
+
+    begun()
+    first = stepped()
+    state = fmu.getFMUState()
+    second = stepped()
+    fmu.setFMUState(state)
+    assert stepped() == second
+    fmu.freeFMUState(state)
+    fmu.reset()
+    begun()
+    assert stepped() == first
+    for refused in (
+        lambda: fmu.doStep(currentCommunicationPoint=0.0, communicationStepSize=0.0),
+        lambda: fmu.setFloat64([keys["current"]], [float("nan")]),
+        lambda: fmu.setFloat64([keys["angle"]], [1.0]),
+        lambda: fmu.getFloat64([99]),
+    ):
+        with pytest.raises(FMICallException):
+            refused()
+    fmu.terminate()
+    fmu.freeInstance()
+    shutil.rmtree(unpacked)
+
+
+@pytest.mark.parametrize("name", FEATURES)
+def test_firmware_can_hold_the_c(name: str, tmp_path: Path) -> None:
+    found, currents = Identified("a */ in a name", BENCH, BENCH.brake, FEATURES[name]), profile(3)
+    (tmp_path / "brake.c").write_text(c_source(found), encoding="utf-8")
+    flags = ["-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror", "-O2", "-shared", "-fPIC"]
+    subprocess.run(["cc", *flags, "-o", "brake.so", "brake.c", "-lm"], cwd=tmp_path, check=True)
+    names = [one.name for one in found.parameters()]
+
+    class Brake(ctypes.Structure):
+        _fields_ = [(n, ctypes.c_double) for n in (*names, "current", *OUTPUTS, "x1", "x2", "w", "i")]
+
+    library, brake = ctypes.CDLL(str(tmp_path / "brake.so")), Brake()
+    library.brake_step.argtypes = [ctypes.POINTER(Brake), ctypes.c_double, ctypes.c_double]
+    library.brake_init(ctypes.byref(brake))
+    assert {n: getattr(brake, n) for n in names} == {one.name: one.value for one in found.parameters()}
+    rows = np.zeros(len(currents), [(n, float) for n in OUTPUTS])
+    for k, current in enumerate(currents):
+        library.brake_step(ctypes.byref(brake), current, T_S)
+        rows[k] = tuple(getattr(brake, n) for n in OUTPUTS)
+    assert_same(rows, expected(found, currents))
+
+
+def test_an_exported_estimate_has_its_values_and_intervals(log: Path, study: Study, tmp_path: Path) -> None:
+    said = api.export(log, tmp_path / "brake.fmu")
+    assert said.endswith("parameters: estimate of run.mcap")
+    model = fmpy.read_model_description(tmp_path / "brake.fmu")
+    shown = {variable.name: variable for variable in model.modelVariables}
+    for c in study:
+        low, high = c.interval
+        assert float(shown[c.label].start) == c.value
+        assert shown[c.label].description.endswith(f"95 %: {low:.5g} to {high:.5g}")
+    assert shown["k_m"].unit == "N.m/A"
+    assert shown["gamma"].description.endswith("not estimated")
+
+
+def test_a_calibration_file_has_each_value_with_its_unit_and_interval(log: Path, study: Study, tmp_path: Path) -> None:
+    api.export(log, tmp_path / "brake.dcm")
+    text = (tmp_path / "brake.dcm").read_bytes().decode("ascii")
+    lines = [line for line in text.splitlines() if line]
+    assert next(line for line in lines if not line.startswith("*")) == "KONSERVIERUNG_FORMAT 2.0"
+    found: dict[str, dict[str, str]] = {}
+    for block in re.findall(r"^FESTWERT (\w+)\n(.*?)^END$", text, re.MULTILINE | re.DOTALL):
+        found[block[0]] = dict(re.findall(r'^ *(LANGNAME|EINHEIT_W|WERT|\*) "?(.*?)"?$', block[1], re.MULTILINE))
+    for c in study:
+        row = found[c.label]
+        assert float(row["WERT"]) == c.value
+        assert row["*"] == "95 %: {:.5g} to {:.5g}".format(*c.interval)
+    assert found["f_v"]["EINHEIT_W"] == "N.m.s/rad"
+    assert found["T_c"]["LANGNAME"] == "Coulomb friction"
+
+
+def test_drawn_brakes_scatter_as_the_estimate_says(study: Study) -> None:
+    e = study.estimate
+    at = [e.unknowns.index(Unknown(name)) for name in PARAMETER_NAMES]
+    draws = [drawn(e, seed) for seed in range(2000)]
+    errors = np.array([z - e.z for z, _ in draws])[:, at]
+    assert errors.std(axis=0) == pytest.approx(e.deviations()[at], rel=0.08)
+    inertia = np.log([factor for _, factor in draws])
+    assert inertia.std() == pytest.approx(BENCH.systematic.inertia, rel=0.08)
+    # The ratios to J are known far better than each: an error of J moves all of them with it.
+    ratio = {one.name.partition("/")[0]: one for one in e.ratios()}["k_m"]
+    relative = (ratio.interval[1] - ratio.interval[0]) / (2.0 * 1.96 * ratio.value)
+    assert (errors[:, 0] - inertia).std() == pytest.approx(relative, rel=0.08)
+
+
+def test_a_seed_draws_the_same_brake_again(log: Path, tmp_path: Path) -> None:
+    for name, seed in (("a", 3), ("b", 3), ("c", 4)):
+        assert api.export(log, tmp_path / f"{name}.c", draw=seed).endswith(f"drawn with seed {seed}")
+    a, b, c = ((tmp_path / f"{name}.c").read_text(encoding="utf-8") for name in "abc")
+    assert a == b != c
+
+
+def test_features_that_are_estimated_are_exported(log: Path, tmp_path: Path) -> None:
+    options = api.EstimateOptions(nuisance="quadratic,contact", starts=1)
+    api.export(log, tmp_path / "brake.fmu", **vars(options))
+    shown = {v.name: v for v in fmpy.read_model_description(tmp_path / "brake.fmu").modelVariables}
+    for name in ("quadratic", "contact"):
+        assert float(shown[name].start) != 0.0
+        assert "; 95 %: " in shown[name].description
+    assert "without quadratic, contact, parameters" in api.export(log, tmp_path / "brake.xml", **vars(options))
+
+
+def test_a_misfit_or_what_is_not_identified_is_refused_before_anything_is_written(
+    tmp_path: Path, replay: Replay
+) -> None:
+    api.simulate(tmp_path / "rough.mcap", plant="rough", seed=1)
+    said = replay.refused("export", tmp_path / "rough.mcap", "-o", tmp_path / "x.fmu", "--model", "exact", code=1)
+    assert "the model 'exact' DOES NOT FIT, so that nothing is written" in said
+    given = ("--theta", "nominal", "--model", "rough")
+    assert replay.text("export", tmp_path / "rough.mcap", "-o", tmp_path / "x.fmu", *given)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["rough.mcap", "x.fmu"]
+
+
+def test_a_parameter_that_is_not_identified_has_no_value_to_export(path: Path, tmp_path: Path, replay: Replay) -> None:
+    said = replay.refused("export", path, "-o", tmp_path / "x.c", code=1)
+    assert "not identified: k_m, k_1, T_c, f_v, so that nothing is written" in said
+    assert not (tmp_path / "x.c").exists()
+
+
+def test_without_a_compiler_an_fmu_has_sources_alone(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, replay: Replay
+) -> None:
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CC", raising=False)
+    said = replay.text("export", log, "-o", tmp_path / "x.fmu", "--theta", "nominal")
+    assert "an FMU of sources alone: there is no C compiler here (gcc and libc6-dev)" in said
+    assert validate_fmu(str(tmp_path / "x.fmu")) == []
+    with zipfile.ZipFile(tmp_path / "x.fmu") as archive:
+        assert not [name for name in archive.namelist() if name.startswith("binaries")]
