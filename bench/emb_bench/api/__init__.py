@@ -16,13 +16,13 @@ from __future__ import annotations
 
 from typing import NoReturn
 
-from emb_bench.analysis.options import EstimateOptions, ReportOptions
+from emb_bench.analysis.options import EstimateOptions, ExportOptions, ReportOptions
 from emb_bench.api.campaigns import campaign
 from emb_bench.api.designs import DesignOptions, design
 from emb_bench.api.estimates import estimate, report
 from emb_bench.api.information import FimOptions, fisher_information, interval, sensitivities
 from emb_bench.api.policies import export_policy
-from emb_bench.api.runs import ExportOptions, Run, draw, export, info, open_run, rerun, timing, topic, topics
+from emb_bench.api.runs import Run, draw, export, info, open_run, rerun, timing, topic, topics
 from emb_bench.api.simulation import simulate
 from emb_bench.batch.row import CampaignOptions
 from emb_runtime.errors import near

@@ -66,7 +66,7 @@ def description(found: Identified, token: str) -> Element:
         generationTool="emb-excite",
     )
     can = ("canHandleVariableCommunicationStepSize", "canGetAndSetFMUState")
-    SubElement(root, "CoSimulation", modelIdentifier=NAME, **dict.fromkeys(can, "true"))
+    SubElement(root, "CoSimulation", {"modelIdentifier": NAME, **dict.fromkeys(can, "true")})
     units = SubElement(root, "UnitDefinitions")
     for unit in dict.fromkeys(["A", "s", *(one.unit for one in parameters), *(unit for unit, _ in OUTPUTS.values())]):
         SubElement(SubElement(units, "Unit", name=unit), "BaseUnit", _base_unit(unit))
@@ -126,7 +126,8 @@ def _glue(found: Identified, token: str) -> str:
 
 def _text(root: Element) -> bytes:
     ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="UTF-8", xml_declaration=True) + b"\n"
+    text: bytes = ElementTree.tostring(root, encoding="UTF-8", xml_declaration=True)
+    return text + b"\n"
 
 
 def _library(inside: Mapping[str, bytes]) -> tuple[bytes, str]:

@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -57,11 +58,12 @@ def profile(seed: int, periods: int = 400) -> Floats:
     return np.repeat(levels, rng.integers(1, 60, periods))[:periods]
 
 
-def expected(found: Identified, currents: Floats, brake: Any = None) -> Floats:
+def expected(found: Identified, currents: Floats) -> Floats:
     """States after each period by the bench's simulation."""
-    x, chosen, s = Theta(brake or found.brake, contact=found.contact).begin(0.0, ())
-    states, _ = trajectory(march, found.mechanics, brake or found.brake, held(currents, T_S), chosen, x, s)
-    return states[1:] + np.array([found.contact, 0.0, 0.0, 0.0])
+    x, chosen, s = Theta(found.brake, contact=found.contact).begin(0.0, ())
+    states, _ = trajectory(march, found.mechanics, found.brake, held(currents, T_S), chosen, x, s)
+    shown: Floats = states[1:] + np.array([found.contact, 0.0, 0.0, 0.0])
+    return shown
 
 
 def simulated(path: Path, currents: Floats, **start: float) -> Any:
@@ -170,12 +172,13 @@ def test_an_importer_can_step_back_reset_and_is_refused_what_is_no_step(tmp_path
     fmu.reset()
     begun()
     assert stepped() == first
-    for refused in (
+    refusals: tuple[Callable[[], object], ...] = (
         lambda: fmu.doStep(currentCommunicationPoint=0.0, communicationStepSize=0.0),
         lambda: fmu.setFloat64([keys["current"]], [float("nan")]),
         lambda: fmu.setFloat64([keys["angle"]], [1.0]),
         lambda: fmu.getFloat64([99]),
-    ):
+    )
+    for refused in refusals:
         with pytest.raises(FMICallException):
             refused()
     fmu.terminate()
