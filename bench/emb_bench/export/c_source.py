@@ -34,7 +34,7 @@ def c_source(found: Identified) -> str:
         f"Made by emb-excite; parameters: {found.source}. Double precision, SI units; a step solves sticking and "
         "contact exactly. Where this file is only declared: #define BRAKE_DECLARATIONS_ONLY.",
         width=112,
-    ).replace("*/", "* /")
+    )
     names = textwrap.fill(", ".join(one.name for one in parameters), 104, subsequent_indent="      ")
     values = "\n".join(
         f"  b->{one.name} = {one.value!r}; /* [{one.unit}] {one.about}; {one.known} */" for one in parameters

@@ -19,7 +19,7 @@ def dcm(found: Identified) -> str:
 
 def write_dcm(found: Identified, path: Path) -> str:
     """Write the calibration file; says which parameters it has."""
-    text = dcm(found).encode("latin-1", "replace")  # the encoding of the format
+    text = dcm(found)
     with replacing(path) as beside:
-        beside.write_bytes(text)
+        beside.write_text(text, encoding="ascii")
     return f"a calibration file, parameters: {found.source}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
@@ -52,6 +53,7 @@ ABOUT: Mapping[str, str] = {
 """Parameters of an exported brake."""
 _CHOSEN = ("x1_0", "x2_0", "tolerance")  # What is of a simulation, not of the brake
 UNITS = SI | {"gamma": "m", "stribeck_exponent": "1", "hysteresis_travel": "rad", "tolerance": "rad/s"}
+_UNSAFE = re.compile(r"[^\w .,=+-]", re.ASCII)  # What a name must not bring into comments of C, XML and DCM
 
 
 class Parameter(NamedTuple):
@@ -126,7 +128,8 @@ def identified(log: RunLog, asked: ExportOptions, estimate: Callable[[], Study])
             raise UsageError("--draw: expected the estimate of the log, whose uncertainty is known, got --theta too")
         bench = bench_for(log, asked.bench)
         name, brake, _ = read_theta(asked.theta, log, bench)
-        return Identified(name, bench, brake, bench.model(asked.model or default_model(log)[0]).mechanics)
+        plant = bench.model(asked.model or default_model(log)[0])
+        return Identified(_UNSAFE.sub("?", name), bench, brake, plant.mechanics)
     study = estimate()
     _check(study)
     e = study.estimate
@@ -140,7 +143,8 @@ def identified(log: RunLog, asked: ExportOptions, estimate: Callable[[], Study])
     z, inertia = (e.z, 1.0) if asked.draw is None else drawn(e, asked.draw)
     brake = e.problem.theta(z)
     values = dict(zip(e.unknowns, e.problem.values(z).tolist(), strict=True))
-    source = f"estimate of {log.path.name}" + ("" if asked.draw is None else f", drawn with seed {asked.draw}")
+    how = "" if asked.draw is None else f", drawn with seed {asked.draw}"
+    source = _UNSAFE.sub("?", f"estimate of {log.path.name}{how}")
     mechanics, contact = e.problem.mechanics(z), values.get(Unknown("contact"), 0.0)
     return Identified(source, e.bench, brake._replace(J=brake.J * inertia), mechanics, contact, intervals)
 

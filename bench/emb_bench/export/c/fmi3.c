@@ -85,7 +85,7 @@ FMI(fmi3GetFloat64)(instance *c, const reference v[], size_t n, double x[], size
 FMI(fmi3SetFloat64)(instance *c, const reference v[], size_t n, const double x[], size_t m) {
   for (size_t k = 0; k < n; k++) {
     if (v[k] < 1 || v[k] > CURRENT || n != m) return refuse(c, "neither a parameter nor the current");
-    if (!isfinite(x[k])) return refuse(c, "expected a finite number");
+    if (!isfinite(x[k]) || (places[v[k]] == PLACE(J) && x[k] <= 0.0)) return refuse(c, "expected a number; J above 0");
     memcpy((char *)c + places[v[k]], &x[k], sizeof(double));
   }
   const double current = c->b.current;
