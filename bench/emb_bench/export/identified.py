@@ -169,15 +169,16 @@ def drawn(e: Estimate, seed: int) -> tuple[Floats, float]:
     """Unknowns drawn from the joint distribution of their total errors, and a factor of J.
 
     By the information, and by each effect of the budget, which moves all unknowns together; an error of J moves J, too.
+    Values are within what is searched.
     """
     rng, inertia = np.random.default_rng(seed), 1.0
     covariance = Spectrum(e.information).inverse()
     if not np.isfinite(covariance).all():
         raise CheckFailedError("--draw: expected that every unknown is identified: leave out a --nuisance")
-    z = rng.multivariate_normal(e.z, covariance, method="cholesky")
+    errors = rng.multivariate_normal(np.zeros(len(e.z)), covariance, method="cholesky")
     for effect in e.validation.budget:
         size = rng.standard_normal()
-        z += size * np.array(effect.bias)
-        inertia *= float(np.exp(size * effect.size)) if effect.name == "J" else 1.0
-    low = [least(unknown.name) for unknown in e.unknowns]
-    return e.problem.coordinates(np.maximum(e.problem.values(z), low)), inertia
+        errors += size * np.array(effect.bias)
+        inertia += size * effect.size if effect.name == "J" else 0.0
+    low, high = (e.problem.values(end) for end in e.problem.bounds)
+    return e.problem.coordinates(np.clip(e.values + e.scale * errors, low, high)), inertia
