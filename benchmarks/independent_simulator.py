@@ -8,6 +8,7 @@ steps of a whole period, which are written down here once more from the equation
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numba
@@ -399,6 +400,23 @@ def motion(brake: Brake, currents: Floats, t_s: float) -> Floats:
     for k, u in enumerate(currents.tolist()):
         state = _move(b, state, u, t_s)
         found[k] = state[:2]
+    return found
+
+
+def clamped(
+    brake: Brake, bench: Bench, law: Callable[[float, float, int], float], periods: int, rng: np.random.Generator
+) -> Floats:
+    """True clamping force at the ends of the periods of a brake from rest at the origin [N], shape (periods,).
+
+    A law answers the angle [rad] and velocity [rad/s] that are shown before each period with a current [A].
+    """
+    b, state, found = brake.numbers(), (0.0, 0.0, brake.current_offset, 0.0, 0.0), np.empty(periods)
+    sensors = _Sensors(brake, bench, rng)
+    for k in range(periods):
+        angle, velocity = sensors.shown(state[0], state[1]).tolist()
+        state = _move(b, state, law(angle, velocity, k), bench.timing.sample_time)
+        x, _, _, z, w = state
+        found[k] = _force(b, x, z, w)
     return found
 
 

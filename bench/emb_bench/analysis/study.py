@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from emb_bench.analysis.clamping import NEEDED, Clamping, clamping
 from emb_bench.analysis.conclusion import Conclusion
 from emb_bench.analysis.drift import Drift, Earlier
 from emb_bench.analysis.options import EstimateOptions
@@ -155,6 +156,12 @@ class Study:
             correlation: Floats = covariance / np.outer(deviations, deviations)
         np.fill_diagonal(correlation, 1.0)
         return correlation
+
+    @property
+    def clamping(self) -> Clamping | None:
+        """Clamping force, holding current and friction band; None of a wrong model, or where a parameter is missing."""
+        known = {name for name in NEEDED if name in self and self[name].identified}
+        return clamping(self.estimate) if known == {*NEEDED} and verdict(self).holds else None
 
     @property
     def residuals(self) -> tuple[Floats, ...]:

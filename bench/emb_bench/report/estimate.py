@@ -44,7 +44,8 @@ def text(study: Study, *, verbose: bool = False) -> str:
     if not any(math.isfinite(c.repeatability) for c in study.conclusions):
         lines += [""]
     elif found.holds or verbose:
-        lines += [*wrapped(say.intervals(e), 0), "", *listed("", _limits(study))]
+        lines += [*wrapped(say.intervals(e), 0), ""]
+        lines += listed("", [say.clamping(study), *_limits(study)])
     else:
         lines += [say.without(study), ""]
     return "\n".join([*lines, *_next(study), *(_evidence(study) if verbose else ())])
@@ -166,6 +167,7 @@ def document(study: Study) -> dict[str, Any]:
             "notes": say.residual_notes(e),
         },
         "parameters": _parameters(study),
+        "clamping": None if study.clamping is None else to_json(study.clamping),
         "ratios": {one.name: _fields(one, "value", "unit") | {"interval_95": one.interval} for one in e.ratios()},
         "models": [
             _fields(c, "fits", "deviance", "bic", "weight")

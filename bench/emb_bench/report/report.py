@@ -268,6 +268,7 @@ def _parameters(study: Study) -> list[Block | None]:
         None if found.holds else Text(f"The intervals do not include {bias}.", "bad"),
         tables.budget(study) if found.holds else None,
         tables.ratios(e) if found.holds else None,
+        tables.clamping(study),
         SIGNATURE,
     ]
 

@@ -460,6 +460,18 @@ def conclusion(c: Conclusion) -> str:
     return "; ".join(filter(None, (amount(c.value, c.interval, c.unit), standing, trade_offs(c.finding), change)))
 
 
+def clamping(study: Study) -> str:
+    """Clamping force, the current that holds it and its friction band; empty where they are not known."""
+    if (found := study.clamping) is None:
+        return ""
+    _, force, current, friction = found
+    known, band = (in_percent(one.total / one.value) for one in (force, friction))
+    return (
+        f"clamping    force known to {known}: {amount(*force.shown)} at {plain(found.angle)} rad, held by "
+        f"{amount(*current.shown)}; friction band ± {plain(friction.value)} N, known to {band}"
+    )
+
+
 def doubts(f: Finding) -> str:
     """Reasons that a parameter is not identified; empty if it is."""
     return "; ".join(DOUBTS[doubt] for doubt in f.doubts)

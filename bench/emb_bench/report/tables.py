@@ -150,6 +150,20 @@ def ratios(e: Estimate) -> Table | None:
     return Table(title, ["ratio", "value ± total", "total"], rows) if rows else None
 
 
+def clamping(study: Study) -> Table | None:
+    """Clamping force of a brake that is applied; None where it is not known."""
+    found = study.clamping
+    if found is None:
+        return None
+    names = {"force": found.force, "current that holds it": found.current, "friction band, ±": found.friction}
+    rows = [[name, amount(*one.shown), relative(one.total, one.value)] for name, one in names.items()]
+    title = (
+        f"Clamping force at {plain(found.angle)} rad from contact. The friction band is by how much the force may "
+        "differ from that of the current while the brake rests; ± is the total (95 %, k=2)"
+    )
+    return Table(title, ["clamping", "value ± total", "total"], rows)
+
+
 def residual_tests(study: Study) -> Table:
     """Tests of the residuals."""
     m = study.estimate.validation
