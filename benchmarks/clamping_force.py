@@ -55,7 +55,7 @@ PLANTS = {"exact": "", "load": "", "cubic": "quadratic,cubic"}
 
 
 class Believed(NamedTuple):
-    """What the controller is told."""
+    """Parameters and offsets that the controller is told."""
 
     brake: BrakeParameters
     mechanics: Mechanics

@@ -35,7 +35,7 @@ FLAT = {"report-joint": 0.1}
 """Two runs that the model does not fit together: many values are nearly as good, and another processor ends at others."""
 SHORT = {
     "fim": 21,
-    "estimate-good": 16,
+    "estimate-good": 18,
     "estimate-misfit": 18,
     "estimate-aborted": 16,
     "info": 14,

@@ -1,4 +1,4 @@
-"""What an estimate tells a force controller: clamping force at an angle, the current that holds it, friction band.
+"""Clamping force at an angle, the current that holds it, and the friction band, from an estimate.
 
 With the clamping force F of :func:`emb_bench.brake.forces.clamping_force` while the brake is applied, and the static
 friction T_s under it,
