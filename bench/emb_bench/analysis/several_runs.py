@@ -43,6 +43,42 @@ def constancy(values: Sequence[float], deviations: Sequence[float]) -> Constancy
     return Constancy(len(v), mean, float(weights.sum() ** -0.5), chi2, p_value, scatter, p_value >= DIFFERENT)
 
 
+BEYOND = 3.0  # Standard deviations from the median at which a control chart has its limits (Shewhart 1931)
+
+
+@dataclass(frozen=True)
+class Slope:
+    """Change of a number with a condition of its runs, by weighted least squares."""
+
+    slope: float  # Per unit of the condition
+    deviation: float  # Standard deviation of it, by those of the measurements
+    p_value: float  # Of a slope as large or larger, of either sign, if there is none
+
+    @property
+    def significant(self) -> bool:
+        """True if the test rejects that there is none."""
+        return self.p_value < DIFFERENT
+
+
+def slope(values: Sequence[float], deviations: Sequence[float], conditions: Sequence[float]) -> Slope | None:
+    """Slope of a number over a condition; None for fewer than three runs, or a condition that does not change."""
+    from scipy import special
+
+    v, x, weights = np.asarray(values), np.asarray(conditions, np.float64), np.asarray(deviations) ** -2.0
+    away = x - weights @ x / weights.sum()
+    spread = float(weights @ away**2)
+    if len(v) < 3 or not spread > 0.0:
+        return None
+    found, deviation = float((weights * away) @ v / spread), spread**-0.5
+    return Slope(found, deviation, float(special.erfc(abs(found / deviation) / math.sqrt(2.0))))
+
+
+def beyond(values: Sequence[float], deviations: Sequence[float]) -> list[int]:
+    """Runs outside of a control chart's limits: beyond the median by ``BEYOND`` standard deviations of their own."""
+    distances = np.abs(np.asarray(values) - np.median(values)) / np.asarray(deviations)
+    return [int(i) for i in np.flatnonzero(distances > BEYOND)] if len(distances) > 2 else []
+
+
 Effects = Mapping[str, tuple[float, float]]
 """Biases by effects, and the sizes of these."""
 

@@ -81,6 +81,7 @@ def _of_the_run(log: RunLog) -> Row:
     cycles, largest = found.cycles, found.largest
     return {
         "start_time": log.span[0],
+        **log.conditions,
         "simulated": bool(log.simulated),
         "exit_reason": escaped(log.exit_reason),
         "complete": log.complete,

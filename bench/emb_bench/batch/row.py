@@ -97,6 +97,8 @@ COLUMNS = {
     "beginning": Column("text", "SHA-256 of the first samples of the experiment, which no two runs have in common"),
     "copy_of": Column("text", "log of the same run that counts in its place; null if this one counts"),
     "start_time": Column("time", "first message, Unix time", "ns"),
+    "temperature": Column("number", "mean temperature of the motor; null if the node does not send it", "degC"),
+    "supply_voltage": Column("number", "mean supply voltage; null if the node does not send it", "V"),
     "simulated": Column("truth", "no real machine was driven, by what the log says"),
     "exit_reason": Column("text", "why the run ended"),
     "complete": Column("truth", "neither the log nor the experiment lacks anything"),

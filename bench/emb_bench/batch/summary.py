@@ -9,18 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.analysis.several_runs import Constancy, constancy
+from emb_bench.analysis.several_runs import Constancy, Slope, beyond, constancy, slope
 from emb_bench.batch.row import NONE, CampaignOptions, Row, unit_of
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.documents import to_json
 from emb_bench.estimate.records import DONE
-from emb_bench.numbers import p_value, relative
+from emb_bench.numbers import p_value, relative, signed
 from emb_bench.report.sentences import INTERVALS
 from emb_bench.report.text import Table, listed, wrapped
 from emb_runtime.numbers import NOTHING, plain
 
 SHOWN = 3  # Most logs of a kind that are named without ``-v``
 OF_AN_ESTIMATE = ("estimate", "low", "high", "between_runs", "repeatability")
+CONDITIONS = {"start_time": (1.0 / 3.6e12, "h"), "temperature": (1.0, "°C"), "supply_voltage": (1.0, "V")}
+"""Columns that a parameter may change with: factor to their unit, and that unit."""
 OVER_RUNS = f"The mean is weighted by information, total and repeatability are medians. {INTERVALS}"
 
 
@@ -33,6 +35,8 @@ class ParameterEstimates:
     total: float  # Median of half the 95 % intervals, of noise, systematic errors and what the records cannot exclude
     repeatability: float  # The same, of the sensors' noise alone
     constancy: Constancy
+    over: dict[str, Slope]  # Change with time [1/h] and conditions, by name; without those that are not known
+    beyond: tuple[str, ...]  # Logs outside of the control chart's limits
 
 
 @dataclass(frozen=True)
@@ -136,12 +140,21 @@ def _estimates(used: Sequence[Row], name: str) -> ParameterEstimates | None:
     values = found["estimate"]
     # Shares are of one number, so that what came out small weighs no more.
     scale = abs(float(np.median(values))) if PARAMETERS[name].relative else 1.0
+    deviations = (scale * found["between_runs"]).tolist()
+    over = {}
+    for key, (factor, _) in CONDITIONS.items():
+        known = [i for i, row in enumerate(used) if row.get(key) is not None]
+        at = [factor * (used[i][key] - used[known[0]][key]) for i in known]
+        if (one := slope(values[known].tolist(), [deviations[i] for i in known], at)) is not None:
+            over[key] = one
     return ParameterEstimates(
         runs=len(used),
         median=float(np.median(values)),
         total=float(np.median(0.5 * (found["high"] - found["low"]))),
         repeatability=float(np.median(found["repeatability"])),
-        constancy=constancy(values.tolist(), (scale * found["between_runs"]).tolist()),
+        constancy=constancy(values.tolist(), deviations),
+        over=over,
+        beyond=tuple(used[i]["log"] for i in beyond(values.tolist(), deviations)),
     )
 
 
@@ -168,7 +181,7 @@ def text(c: Campaign, *, verbose: bool = False) -> str:
     lines += ["", *parameter_table(c).lines()]
     if c.method != NONE:
         lines += wrapped(OVER_RUNS, 0)
-    return "\n".join([*lines, *listed("", _agreement(c))])
+    return "\n".join([*lines, *listed("", [*_agreement(c), *_trend(c)])])
 
 
 def _agreement(c: Campaign) -> Iterator[str]:
@@ -181,6 +194,22 @@ def _agreement(c: Campaign) -> Iterator[str]:
         if not test.constant:
             scatter = f"scatter {plain(test.scatter)} times the stated one"
             yield f"{name}: the runs do NOT agree ({p_value(test.p_value)}); {scatter}"
+
+
+def _trend(c: Campaign) -> Iterator[str]:
+    """Significant changes of the parameters with time and conditions, and runs beyond the control limits."""
+    for name, p in c.parameters.items():
+        if p.estimate is None:
+            continue
+        for key, one in p.estimate.over.items():
+            if one.significant:
+                share = one.slope / abs(p.estimate.median) if p.relative else one.slope
+                size = f"{signed(100.0 * share)} %" if p.relative else f"{signed(share)} {p.unit}"
+                with_ = "time" if key == "start_time" else key.replace("_", " ")
+                yield f"{name} changes with {with_}: {size} per {CONDITIONS[key][1]} ({p_value(one.p_value)})"
+        if p.estimate.beyond:
+            logs = ", ".join(p.estimate.beyond[:SHOWN]) + (" ..." if len(p.estimate.beyond) > SHOWN else "")
+            yield f"{name}: beyond the control limits (3 deviations between runs) of the others: {logs}"
 
 
 def _notes(c: Campaign) -> Iterator[str]:

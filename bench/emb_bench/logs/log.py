@@ -349,6 +349,18 @@ class RunLog:
             raise LogError(f"{self.path}: no decoded message is called {message}") from None
 
     @cached_property
+    def conditions(self) -> Mapping[str, float]:
+        """Mean temperature of the motor [degC] and supply voltage [V], by name; what no frame says is left out."""
+        found, topic = dict[str, float](), "/emb/EMB_Conditions"
+        for name, signal in {"temperature": "Temperature", "supply_voltage": "SupplyVoltage"}.items():
+            values = np.asarray(self.tables[topic].get(signal, ()), np.float64) if topic in self.topics else np.empty(0)
+            one = load_layout().conditions.signal(signal)
+            known = values[(values >= one.minimum) & (values <= one.maximum)]  # this way round, NaN is none
+            if known.size:
+                found[name] = float(known.mean())
+        return found
+
+    @cached_property
     def wall_offset_ns(self) -> int:
         """Unix time minus the run's monotonic clock [ns]."""
         for publish_time, monotonic_ns in self.rows("/clock", "publish_time", "monotonic_ns"):

@@ -55,7 +55,7 @@ UNITS_OF_METADATA = {
 """Units of numbers in a log's metadata, by the ends of their names."""
 EVENTS = 200  # Most safety events that are shown; report.json has them all
 SHORT_HASH = 16  # Digits of a hash that are shown where there is no room for all
-SIGNATURE = Facts([("Temperature, supply", ""), ("Tested by, date", ""), ("Signature", "")], "signature")
+BLANK = ("Tested by, date", ""), ("Signature", "")  # Lines to be written on
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -135,7 +135,7 @@ def page_of(report: Report) -> Page:
         "parameters": ("Parameters", _parameters(study)) if shown else None,
         "next": ("What to do next", _next(study, found, to_do)) if to_do else None,
         "motion": (_measured(motions[0]), [_motion(motions[0], drawn[0])]) if one and drawn[0] else None,
-        "tested": ("What was tested", [facts, table, None if shown else SIGNATURE]),
+        "tested": ("What was tested", [facts, table, None if shown else _signature(study)]),
     }
     parts = [Section(name, *part) for name, part in sections.items() if part is not None]
     return Page(
@@ -269,8 +269,17 @@ def _parameters(study: Study) -> list[Block | None]:
         tables.budget(study) if found.holds else None,
         tables.ratios(e) if found.holds else None,
         tables.clamping(study),
-        SIGNATURE,
+        _signature(study),
     ]
+
+
+def _signature(study: Study) -> Facts:
+    """Lines to be signed; temperature and supply as the nodes sent them, the mean of the runs."""
+    logs, told = [run.log.conditions for run in study.used or study.runs], list[str]()
+    for name, unit in (("temperature", "°C"), ("supply_voltage", "V")):
+        if values := [one[name] for one in logs if name in one]:
+            told.append(f"{plain(sum(values) / len(values), 4)} {unit}")
+    return Facts([("Temperature, supply", ", ".join(told)), *BLANK], "signature")
 
 
 def _notable(c: Conclusion) -> bool:

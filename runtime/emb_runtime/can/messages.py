@@ -19,7 +19,7 @@ from emb_runtime.can.generated import Field, generate_codec
 from emb_runtime.records import CurrentCommand, Frame, NodeState
 
 CHARGE: Final = "EMB_Charge"
-OPTIONAL_VERSION: Final = 1  # Version of each of the two messages that a node need not send
+OPTIONAL_VERSION: Final = 1  # Version of each of the three messages that a node need not send
 
 
 class StopReason(IntEnum):
@@ -62,7 +62,7 @@ class StatusFrame(NamedTuple):
 
 
 def _fields(version: int) -> dict[str, tuple[type[Any], tuple[Field, ...]]]:
-    """Record of each message, and the signal of each of its fields: all but the CRC. Nobody decodes the last two."""
+    """Record of each message, and the signal of each of its fields: all but the CRC. Nobody decodes the last three."""
     node_state, optional = Field("NodeState", choices=tuple(NodeState)), Field("Version", fixed=OPTIONAL_VERSION)
     return {
         "EMB_Command": (
@@ -94,6 +94,7 @@ def _fields(version: int) -> dict[str, tuple[type[Any], tuple[Field, ...]]]:
                 *(Field(name, saturates=True) for name in ("NotSent", "Braked", "NotBelieved", "Refused")),
             ),
         ),
+        "EMB_Conditions": (tuple, (Field("Counter"), optional, Field("Temperature"), Field("SupplyVoltage"))),
     }
 
 
@@ -113,12 +114,14 @@ class Layout:
     status: Message
     charge: Message  # A node may send it
     gateway: Message  # A gateway sends it
+    conditions: Message  # A node may send it
     write_command: Callable[[int, int, float, bool], tuple[Frame, CurrentCommand]]  # With the command as it is read
     encode_angle: Callable[[int, float, int], Frame]
     encode_velocity: Callable[[int, float, float, NodeState, int], Frame]
     encode_status: Callable[[int, NodeState, StopReason, int, int], Frame]  # The version is the layout's
     encode_charge: Callable[[int, float], Frame]  # Counter of the sample, and the integral of the current up to it
     encode_gateway: Callable[[int, int, int, int, int], Frame]  # Counter, and counts since the gateway started
+    encode_conditions: Callable[[int, float, float], Frame]  # Counter, temperature [degC], supply voltage [V]
     decode_command: Callable[[Frame], CurrentCommand]
     decode_angle: Callable[[Frame], AngleFrame]
     decode_velocity: Callable[[Frame], VelocityFrame]
@@ -136,7 +139,7 @@ class Layout:
     @property
     def known(self) -> tuple[Message, ...]:
         """All messages, those included that need not be sent."""
-        return (*self.messages.values(), self.charge, self.gateway)
+        return (*self.messages.values(), self.charge, self.gateway, self.conditions)
 
     @property
     def device_time_period_ns(self) -> int:

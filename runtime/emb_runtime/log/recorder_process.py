@@ -57,7 +57,7 @@ BATCH = 128  # Records between two looks at the clock
 
 RUN = "emb.run"
 END = "emb.end"  # Names of the metadata records with the run's identity and with its outcome
-OPTIONAL = {"/estimate", "/drive/rx", "/emb/EMB_Charge"}  # Topics that not every log has
+OPTIONAL = {"/estimate", "/drive/rx", "/emb/EMB_Charge", "/emb/EMB_Conditions"}  # Topics that not every log has
 DIED = "the runtime process died"  # Exit reason in a log whose runtime ended without saying why
 
 

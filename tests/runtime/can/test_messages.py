@@ -54,6 +54,8 @@ GOLDEN = {
     "EMB_Charge": (0x0FF, "eb 15 30edecffff", LAYOUT.encode_charge(5, -0.25)),
     # 0x16: version 1, counter 6. 258 = 0x0102 not sent, 772 = 0x0304 braked, 0xABC not believed, above it 0xD refused.
     "EMB_Gateway": (0x103, "db 16 0201 0403 bcda", LAYOUT.encode_gateway(6, 258, 772, 0xABC, 0xD)),
+    # 0x15: version 1, counter 5. −12.34 °C / 0.01 = −1234 = 0xFB2E. 23.99 V / 0.01 V = 2399 = 0x095F.
+    "EMB_Conditions": (0x104, "55 15 2efb 5f09", LAYOUT.encode_conditions(5, -12.34, 23.99)),
 }
 
 
@@ -318,7 +320,7 @@ def test_a_decoded_value_out_of_range_is_rejected_for_it() -> None:
 
 def test_the_description_says_what_the_dbc_says() -> None:
     assert list(LAYOUT.messages) == ["EMB_Command", "EMB_Angle", "EMB_Velocity", "EMB_Status"]
-    assert [m.name for m in LAYOUT.known] == [*LAYOUT.messages, "EMB_Charge", "EMB_Gateway"]
+    assert [m.name for m in LAYOUT.known] == [*LAYOUT.messages, "EMB_Charge", "EMB_Gateway", "EMB_Conditions"]
     for message in MESSAGES:
         theirs = DATABASE.get_message_by_name(message.name)
         assert (message.identifier, message.length) == (theirs.frame_id, theirs.length)

@@ -1,0 +1,76 @@
+"""Temperature and supply voltage: from the node's frame to log, campaign, control chart and certificate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from pyarrow import parquet
+
+from emb_bench.analysis.several_runs import beyond, slope
+from emb_bench.logs.log import read_log
+from emb_runtime.can.messages import load_layout
+from emb_runtime.records import Frame
+
+from tests.bench.conftest import Replay  # isort: skip
+from tests.bench.report_pages import make  # isort: skip
+from tests.bench.simulated_logs import square, write_log  # isort: skip
+from tests.conftest import Simulate  # isort: skip
+from tests.independent import protected  # isort: skip
+
+LAYOUT = load_layout()
+BODY = bytes.fromhex("17 ff7f ffff")  # 327.67 °C and 655.35 V: beyond the ranges, CRC right
+
+
+def told(frames: list[Frame]) -> Callable[..., Frame | None]:
+    """Puts frames on the bus of a run, each in the place of a status."""
+    sent = 0
+
+    def receive(frame: Frame | None, *_: object) -> Frame | None:
+        nonlocal sent
+        if frame is None or frame.identifier != LAYOUT.status.identifier or sent == len(frames):
+            return frame
+        sent += 1
+        return frames[sent - 1]._replace(time_ns=frame.time_ns)
+
+    return receive
+
+
+def test_they_go_from_the_bus_to_log_campaign_and_certificate(
+    tmp_path: Path, simulate: Simulate, replay: Replay
+) -> None:
+    frames = [LAYOUT.encode_conditions(0, 41.0, 23.9), LAYOUT.encode_conditions(1, 42.0, 24.1)]
+    hostile = Frame(LAYOUT.conditions.identifier, protected(LAYOUT.conditions.identifier, BODY))
+    damaged = frames[0]._replace(data=bytes(6))
+    run = simulate(square, options="plant=exact,seed=5", on_receive=told([*frames, hostile, damaged]))
+    warm = write_log(tmp_path / "warm.mcap", run)
+    plain = write_log(tmp_path / "plain.mcap", simulate(square, options="plant=exact,seed=6"))
+    log = read_log(warm)
+    assert log.conditions == pytest.approx({"temperature": 41.5, "supply_voltage": 24.0})
+    assert log.end["undecoded_frames"] == "2", "what is out of range or damaged is no value"
+    assert (read_log(plain).conditions, "/emb/EMB_Conditions" in read_log(plain).topics) == ({}, False)
+    rows = tmp_path / "rows.parquet"
+    replay.text("campaign", warm, plain, "-o", rows, "--method", "none", "--jobs", "1")
+    table = parquet.read_table(rows)
+    assert table.schema.field("temperature").metadata[b"unit"] == b"degC"
+    assert sorted(table["supply_voltage"].to_pylist(), key=str) == [pytest.approx(24.0), None]
+    assert "41.5 °C, 24 V" in make(tmp_path / "warm.html", warm, "--starts", "1").reader.texts
+    assert "41.5 °C" not in " ".join(make(tmp_path / "plain.html", plain, "--starts", "1").reader.texts)
+
+
+def test_a_slope_over_a_condition_is_that_of_weighted_least_squares() -> None:
+    found = slope([1.0, 2.0, 3.5, 3.9], [0.1, 0.1, 0.2, 0.1], [20.0, 30.0, 45.0, 50.0])
+    assert found is not None
+    weights, x = [100.0, 100.0, 25.0, 100.0], [20.0, 30.0, 45.0, 50.0]
+    mean = sum(w * at for w, at in zip(weights, x, strict=True)) / sum(weights)
+    spread = sum(w * (at - mean) ** 2 for w, at in zip(weights, x, strict=True))
+    values = zip(weights, x, [1.0, 2.0, 3.5, 3.9], strict=True)
+    assert found.slope == pytest.approx(sum(w * (at - mean) * v for w, at, v in values) / spread)
+    assert (found.deviation, found.significant) == (pytest.approx(spread**-0.5), True)
+    assert slope([1.0, 2.0, 3.0], [0.1] * 3, [20.0] * 3) is None, "nothing changes with what does not change"
+
+
+def test_a_run_beyond_the_control_limits_is_named_and_those_of_plain_scatter_are_not() -> None:
+    assert beyond([1.0, 1.1, 0.9, 1.05, 2.0], [0.1] * 5) == [4]
+    assert beyond([1.0, 1.1, 0.9, 1.05], [0.1] * 4) == []
