@@ -11,8 +11,8 @@ by proportion and derivative. A force's error is that at the end of its step.
 
 The bound of an error is the total of ``force`` of :func:`emb_bench.analysis.clamping.clamping` at the angle of the
 step. A row has the brakes that the model fits, the 95 % quantiles of the errors, their ratio, and how often the bounds
-held; below it, how often the totals of force, holding current and friction band held the true ones. The two steps of one brake are not
-independent, and count as if they were.
+held; below it, how often the totals of force, holding current and friction band held the true ones. The two
+steps of one brake are not independent, and count as if they were.
 """
 
 from __future__ import annotations
