@@ -36,6 +36,7 @@ from benchmarks.independent_simulator import Brake, brake_of, clamped
 from benchmarks.interval_coverage import share
 from emb_bench import api
 from emb_bench.analysis.clamping import clamping
+from emb_bench.analysis.study import Study
 from emb_bench.brake.forces import clamping_force, decay, sliding_torque, static_torque
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import Mechanics, Plant
@@ -102,7 +103,7 @@ def seen(truth: Truth, plant: Plant) -> tuple[BrakeParameters, Plant]:
     return p._replace(k_m=p.k_m * s, T_c=p.T_c * s), Plant(plant.name, turned, instruments)
 
 
-def estimated(bench: Bench, plant: Plant, truth: Truth, seed: int) -> api.Study:
+def estimated(bench: Bench, plant: Plant, truth: Truth, seed: int) -> Study:
     """The estimate from one run with the shipped actor."""
     theta, shown = seen(truth, plant)
     to_drive = BrakeToSimulate(theta, shown, gaussian_noise(bench.noise, seed), seed, charge=False)

@@ -40,7 +40,7 @@ SHORT = {
     "estimate-aborted": 16,
     "info": 14,
     "timing": 14,
-    "campaign": 17,
+    "campaign": 19,
     "design": 14,
 }
 """Pages without ``-v``: as wide as a terminal, and at most so many lines."""

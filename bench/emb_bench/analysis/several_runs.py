@@ -51,7 +51,7 @@ class Slope:
     """Change of a number with a condition of its runs, by weighted least squares."""
 
     slope: float  # Per unit of the condition
-    deviation: float  # Standard deviation of it, by those of the measurements
+    deviation: float  # Standard deviation of it, by those of the measurements or by a larger scatter about the line
     p_value: float  # Of a slope as large or larger, of either sign, if there is none
 
     @property
@@ -62,15 +62,22 @@ class Slope:
 
 def slope(values: Sequence[float], deviations: Sequence[float], conditions: Sequence[float]) -> Slope | None:
     """Slope of a number over a condition; None for fewer than three runs, or a condition that does not change."""
+    if len(values) < 3:
+        return None
     from scipy import special
 
     v, x, weights = np.asarray(values), np.asarray(conditions, np.float64), np.asarray(deviations) ** -2.0
     away = x - weights @ x / weights.sum()
     spread = float(weights @ away**2)
-    if len(v) < 3 or not spread > 0.0:
+    if not spread > 0.0:
         return None
-    found, deviation = float((weights * away) @ v / spread), spread**-0.5
-    return Slope(found, deviation, float(special.erfc(abs(found / deviation) / math.sqrt(2.0))))
+    found, freedom = float((weights * away) @ v / spread), len(v) - 2
+    left = v - weights @ v / weights.sum() - found * away
+    scatter = math.sqrt(float(weights @ left**2) / freedom)  # about the line, over that of the stated deviations
+    deviation = spread**-0.5 * max(1.0, scatter)
+    size = abs(found / deviation)
+    p_value = 2.0 * special.stdtr(freedom, -size) if scatter > 1.0 else special.erfc(size / math.sqrt(2.0))
+    return Slope(found, deviation, float(p_value))
 
 
 def beyond(values: Sequence[float], deviations: Sequence[float]) -> list[int]:

@@ -209,7 +209,7 @@ def _trend(c: Campaign) -> Iterator[str]:
                 yield f"{name} changes with {with_}: {size} per {CONDITIONS[key][1]} ({p_value(one.p_value)})"
         if p.estimate.beyond:
             logs = ", ".join(p.estimate.beyond[:SHOWN]) + (" ..." if len(p.estimate.beyond) > SHOWN else "")
-            yield f"{name}: beyond the control limits (3 deviations between runs) of the others: {logs}"
+            yield f"{name}: beyond the control limits (3 deviations between runs from the median): {logs}"
 
 
 def _notes(c: Campaign) -> Iterator[str]:

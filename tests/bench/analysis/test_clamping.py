@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -68,7 +69,7 @@ def test_a_brake_is_told_at_the_largest_angle_that_it_clamped_to(study: Study) -
         ({"model": "exact"}, "the model does not fit"),
     ],
 )
-def test_no_force_is_told_of_what_is_not_known(path: Path, options: dict[str, str], why: str) -> None:
+def test_no_force_is_told_of_what_is_not_known(path: Path, options: dict[str, Any], why: str) -> None:
     assert api.estimate(path, starts=1, **options).clamping is None, why
 
 

@@ -67,7 +67,11 @@ def test_a_slope_over_a_condition_is_that_of_weighted_least_squares() -> None:
     spread = sum(w * (at - mean) ** 2 for w, at in zip(weights, x, strict=True))
     values = zip(weights, x, [1.0, 2.0, 3.5, 3.9], strict=True)
     assert found.slope == pytest.approx(sum(w * (at - mean) * v for w, at, v in values) / spread)
-    assert (found.deviation, found.significant) == (pytest.approx(spread**-0.5), True)
+    assert found.deviation == pytest.approx(spread**-0.5)
+    assert found.significant
+    scattered = slope([1.0, 3.0, 0.5, 3.9], [0.1] * 4, x)
+    assert scattered is not None
+    assert not scattered.significant, "runs that scatter more than they state tell no slope"
     assert slope([1.0, 2.0, 3.0], [0.1] * 3, [20.0] * 3) is None, "nothing changes with what does not change"
 
 
