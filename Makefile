@@ -7,6 +7,7 @@
 # make mutation | mutation-changed   changes one place of them at a time; each change must make a test fail
 # make compiled   the core of the cycle compiled, compared with its sources bit for bit, and run
 # make package   wheels, with the compiled core and without, and sdist: checked, installed in an empty environment, run
+# make job   the job of docs/howto/kernel-with-can.md with the wheels in dist/, in a clean root: its commands and exit codes
 # make lint | bench | docs | clean
 # make study-thesis | study-reproduce   the thesis's analysis, its trainings (hours), into build/
 # make figures   the rows of docs/figures.md, measured anew (a day)
@@ -20,7 +21,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c const
 TORCH := $(shell grep '^torch==' constraints.txt)
 WORKERS ?= $(shell n=$$(nproc); echo $$((n < 4 ? n : 4)))
 
-.PHONY: help demo test pytest hil browser night compiled lint coverage mutation mutation-changed package bench docs clean
+.PHONY: help demo test pytest hil browser night compiled lint coverage mutation mutation-changed package job bench docs clean
 
 help:
 	@sed -n '/^$$/q; s/^# //p' Makefile
@@ -135,12 +136,25 @@ package: $(VENV)/.dev
 	$(BIN)/python -m twine check --strict dist/*
 	for wheel in dist/*.whl; do $(BIN)/python .ci/package_files.py $$wheel || exit 1; done
 	$(PYTHON) -m venv --clear build/wheel
+	set -e; for extra in '' '[bench]' '[train]'; do \
+		$(PYTHON) -m venv --clear build/wheel; \
+		if [ "$$extra" = '[train]' ]; then $(WHEEL_PIP) $(TORCH); fi; \
+		$(WHEEL_PIP) --find-links dist "emb-excite$$extra"; \
+		case $$extra in \
+		'[bench]') (cd build/wheel && bin/emb-run --iface sim --log run.mcap --report run.html);; \
+		'[train]') (cd build/wheel && bin/emb-train --version && bin/emb-export step -o step.onnx);; \
+		esac; \
+	done
+	$(PYTHON) -m venv --clear build/wheel
 	$(WHEEL_PIP) dist/*-none-any.whl
 	cd build/wheel && bin/emb-run --iface sim --log run.mcap && bin/emb-replay fim run.mcap
 	$(WHEEL_PIP) --force-reinstall --no-deps dist/*-linux_*.whl
 	cd build/wheel && bin/emb-run --iface sim --log compiled.mcap
 	cd build/wheel && EMB_CORE=python bin/emb-run --iface sim --log fallback.mcap
 	build/wheel/bin/python .ci/same_run.py build/wheel/compiled.mcap build/wheel/fallback.mcap
+
+job: $(VENV)/.dev
+	$(BIN)/python .ci/job.py dist
 
 bench: $(VENV)/.dev
 	@set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python "$$file"; done

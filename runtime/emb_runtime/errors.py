@@ -60,7 +60,7 @@ def needs(purpose: str, extra: str) -> Iterator[None]:
         library = (err.name or str(err)).partition(".")[0]
         raise UsageError(
             f"{purpose} needs {library}: in the clone, pip install -c constraints.txt -e '.[{extra}]'; "
-            f"from a wheel, pip install 'FILE.whl[{extra}]'"
+            f"from a folder of wheels, pip install --find-links dist 'emb-excite[{extra}]'"
         ) from err
 
 

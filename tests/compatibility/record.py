@@ -12,7 +12,7 @@ from pathlib import Path
 from unittest.mock import patch
 
 from emb_bench.config.bench import Bench
-from emb_bench.sim import transport
+from emb_bench.sim.transport import SimTransport, SteppedClock, open_sim
 from emb_runtime.can.messages import load_layout
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.records import Frame
@@ -22,9 +22,9 @@ FIRST_WRONG = 420  # Angle frame
 WRONG = 5.0  # [rad]
 
 
-def with_wrong_angles(options: str, bench: Bench) -> tuple[transport.SimTransport, transport.SteppedClock]:
+def with_wrong_angles(options: str, bench: Bench) -> tuple[SimTransport, SteppedClock]:
     """A simulated bus on which every other angle is wrong from one on."""
-    opened, clock = transport.open_brake(transport.read_brake(options, bench, "sim: "), bench)
+    opened, clock = open_sim(options, bench)
     layout, receive, seen = load_layout(), opened.receive, 0
 
     def received(deadline_ns: int) -> Frame | None:
@@ -47,10 +47,10 @@ def main() -> None:
     """Record both."""
     arguments = ["--iface", "sim:plant=exact,seed=3", "--duration", "0.25", "-q", "--log"]
     sys.argv[0] = "emb-run"
-    for name, bus in (("done", transport.open_sim), ("rejected", with_wrong_angles)):
+    for name, bus in (("done", open_sim), ("rejected", with_wrong_angles)):
         log = FOLDER / f"{name}.mcap"
         log.unlink(missing_ok=True)
-        with patch.object(transport, "open_sim", bus):
+        with patch("emb_bench.sim.transport.open_sim", bus):
             emb_run([*arguments, str(log)])
 
 

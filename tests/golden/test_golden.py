@@ -32,7 +32,7 @@ UNIQUE = re.compile(
 """Hashes, numbers of reports, dates and the version."""
 RELATIVE = 0.02
 FLAT = {"report-joint": 0.1}
-"""Two runs that the model does not fit together: many values are nearly as good, and another processor ends at others."""
+"""Two runs that the model does not fit: many values are nearly as good, and another processor ends at others."""
 SHORT = {
     "fim": 21,
     "estimate-good": 18,

@@ -5,10 +5,14 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterable
+from importlib import resources
 from pathlib import Path
+from typing import Any
 
+import asammdf
 import can
 import can.logconvert
+import cantools
 import pytest
 
 from emb_bench.logs.can_files import McapReader
@@ -123,7 +127,7 @@ with can.LogReader(sys.argv[1]) as reader:
     subprocess.run([sys.executable, "-c", code, path, str(count)], check=True, timeout=120)
 
 
-@pytest.mark.parametrize("form", ["blf", "asc", "log"])
+@pytest.mark.parametrize("form", ["blf", "asc", "log", "mf4"])
 def test_can_logconvert_writes_every_frame_of_a_log(
     run: SimRun, tmp_path: Path, form: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -152,3 +156,21 @@ def test_can_logconvert_writes_every_frame_of_a_log(
         assert message.dlc == len(frame.data) or (frame.remote and form == "log")  # candump's R has no length
         if not frame.remote:
             assert bytes(message.data) == frame.data
+
+
+@pytest.mark.filterwarnings("ignore")  # asammdf's own
+def test_asammdf_decodes_the_mf4_with_the_dbc_of_the_package(
+    run: SimRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, out = write_log(tmp_path / "run.mcap", run, steps=STEPS), tmp_path / "run.mf4"
+    monkeypatch.setattr(sys, "argv", ["can_logconvert", str(path), str(out)])
+    can.logconvert.main()
+    dbc = str(resources.files("emb_runtime.can").joinpath("emb.dbc"))
+    decoded = asammdf.MDF(out).extract_bus_logging({"CAN": [(dbc, 0)]}).get("Angle")
+    database: Any = cantools.database.load_file(dbc)  # an independent decoder's values
+    message = database.get_message_by_name("EMB_Angle")
+    angles = [
+        message.decode(frame.data)["Angle"] for frame in read_log(path).frames if frame.identifier == message.frame_id
+    ]
+    assert len(angles) > STEPS
+    assert decoded.samples.tolist() == pytest.approx(angles, abs=1e-12)
