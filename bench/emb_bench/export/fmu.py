@@ -135,11 +135,14 @@ def _library(inside: Mapping[str, bytes]) -> tuple[bytes, str]:
     compiler = shutil.which(os.environ.get("CC") or "cc") or shutil.which("gcc")
     if compiler is None or sys.platform != "linux":
         return b"", "there is no C compiler here (gcc and libc6-dev)" if compiler is None else "this is not Linux"
-    with TemporaryDirectory() as folder:
-        for name, content in inside.items():
-            (Path(folder) / Path(name).name).write_bytes(content)
-        command = [compiler, *_FLAGS, "-o", "brake.so", "fmi3.c", "-lm"]
-        made = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-        if made.returncode:
-            return b"", f"{compiler} failed: {next(iter(made.stderr.splitlines()), '')}"
-        return (Path(folder) / "brake.so").read_bytes(), ""
+    try:
+        with TemporaryDirectory() as folder:
+            for name, content in inside.items():
+                (Path(folder) / Path(name).name).write_bytes(content)
+            command = [compiler, *_FLAGS, "-o", "brake.so", "fmi3.c", "-lm"]
+            made = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+            if made.returncode:
+                return b"", f"{compiler} failed: {next(iter(made.stderr.splitlines()), f'exit code {made.returncode}')}"
+            return (Path(folder) / "brake.so").read_bytes(), ""
+    except OSError as err:  # no place for temporary files, or no program
+        return b"", f"it was not compiled: {err.strerror}"

@@ -13,7 +13,7 @@ from emb_bench.analysis.options import ExportOptions
 from emb_bench.brake.motion import Floats, is_plain
 from emb_bench.brake.parameters import SI, least
 from emb_bench.config.plants import DEFAULT_PLANT, EULER, Mechanics
-from emb_bench.estimate.records import NORMAL_95, Unknown
+from emb_bench.estimate.records import NORMAL_95, Unknown, searched
 from emb_bench.experiment.theta import read_theta
 from emb_bench.information.evaluation import bench_for, default_model
 from emb_bench.information.identifiability import Spectrum
@@ -181,4 +181,6 @@ def drawn(e: Estimate, seed: int) -> tuple[Floats, float]:
         errors += size * np.array(effect.bias)
         inertia += size * effect.size if effect.name == "J" else 0.0
     low, high = (e.problem.values(end) for end in e.problem.bounds)
+    least_inertia, most = searched(e.bench, Unknown("J"))
+    inertia = min(max(inertia, least_inertia / e.theta.J), most / e.theta.J)
     return e.problem.coordinates(np.clip(e.values + e.scale * errors, low, high)), inertia

@@ -245,6 +245,13 @@ def test_drawn_brakes_scatter_as_the_estimate_says(study: Study) -> None:
     assert (errors[:, 0] - inertia).std() == pytest.approx(relative, rel=0.08)
 
 
+def test_a_drawn_inertia_is_positive_where_it_is_hardly_known(log: Path, tmp_path: Path) -> None:
+    bench = tmp_path / "bench.toml"
+    bench.write_text(re.sub(r"(?m)^inertia .*$", "inertia = 0.45", BENCH.text), encoding="utf-8")
+    e = api.estimate(log, bench=bench, starts=1).estimate
+    assert min(drawn(e, seed)[1] for seed in range(300)) > 0.0  # a normal distribution is negative at seed 220
+
+
 def test_a_hostile_file_name_stays_in_its_comment(log: Path, tmp_path: Path) -> None:
     shutil.copy(log, path := tmp_path / 'x * "\x01\udcff.mcap')
     for ending in ("fmu", "c", "dcm"):
@@ -289,13 +296,25 @@ def test_a_parameter_that_is_not_identified_has_no_value_to_export(path: Path, t
     assert not (tmp_path / "x.c").exists()
 
 
-def test_without_a_compiler_an_fmu_has_sources_alone(
-    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, replay: Replay
+@pytest.mark.parametrize(
+    ("script", "reason"),
+    [
+        ("", "there is no C compiler here (gcc and libc6-dev)"),
+        ("#!/bin/sh\nexit 3\n", "failed: exit code 3"),
+        ("#!/nowhere\n", "it was not compiled: No such file or directory"),
+    ],
+)
+def test_without_a_compiler_that_works_an_fmu_has_sources_alone(
+    script: str, reason: str, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, replay: Replay
 ) -> None:
     monkeypatch.setenv("PATH", "")
-    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("CC", str(tmp_path / "cc"))
+    if script:
+        (tmp_path / "cc").write_text(script, encoding="utf-8")
+        (tmp_path / "cc").chmod(0o755)
     said = replay.text("export", log, "-o", tmp_path / "x.fmu", "--theta", "nominal")
-    assert "an FMU of sources alone: there is no C compiler here (gcc and libc6-dev)" in said
+    assert said.startswith(f"{tmp_path / 'x.fmu'}: an FMU of sources alone: ")
+    assert reason in said
     assert validate_fmu(str(tmp_path / "x.fmu")) == []
     with zipfile.ZipFile(tmp_path / "x.fmu") as archive:
         assert not [name for name in archive.namelist() if name.startswith("binaries")]
