@@ -50,6 +50,7 @@ COMMANDS = {
 SHELLS = {"bash": "completions/bash/{}", "zsh": "completions/zsh/_{}"}
 MAPPING: Any = dict  # A type whose parts are found here
 LIST: Any = list
+_OF_A_FILE = re.compile("FILE|DIR|CSV|POLICY|THETA")  # Names of arguments that may be a file, and something else, too
 _FIELD = re.compile(r'^    (\w+): (?:.*?  # (.+)|.*\n    """((?:.|\n)+?)""")$', re.MULTILINE)
 
 
@@ -147,7 +148,7 @@ def completed(command: str) -> argparse.ArgumentParser:
     parsers = [parser]
     for one in parsers:
         for action in one._actions:
-            if action.type is Path:
+            if action.type is Path or _OF_A_FILE.search(str(action.metavar)):
                 action.complete = shtab.FILE  # type: ignore[attr-defined]  # which shtab looks for
             if isinstance(action, argparse._SubParsersAction):
                 parsers += action.choices.values()

@@ -139,6 +139,20 @@ def test_a_machine_has_no_shield_and_every_other_bench_has_one() -> None:
     assert judge.is_valid(document | {"machine": {"unknown": ["T_c"]}})
 
 
+@pytest.mark.parametrize(
+    "typed", ["emb-run --log", "emb-replay estimate", "emb-replay fim run.mcap --theta", "emb-commission", "emb-export"]
+)
+def test_bash_completes_names_of_files(typed: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.csv").touch()
+    command, count = typed.split()[0], len(typed.split())
+    asked = (
+        f"source {ROOT / 'completions' / 'bash' / command}; COMP_WORDS=({typed} mi); COMP_CWORD={count}; "
+        f"$(complete -p {command} | sed 's/.*-F \\([^ ]*\\) .*/\\1/'); echo ${{COMPREPLY[@]}}"
+    )
+    done = subprocess.run(["bash", "-c", asked], capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert (done.stdout, done.stderr) == ("mine.csv\n", "")
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_bash_completes_options_and_commands(command: str) -> None:
     script = ROOT / "completions" / "bash" / command
