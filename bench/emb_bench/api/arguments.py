@@ -66,7 +66,7 @@ def opened(run: Any, map_path: str | Path | None = None) -> RunLog:
         from emb_bench.recordings.map_file import KINDS
 
         if Path(run).suffix.lower() in KINDS:
-            raise UsageError(f"{run}: a recording of others: estimate, fim and report read it with --map FILE")
+            raise UsageError(f"{run}: a recording of others: estimate, fim, report and export read it with --map FILE")
         return read_log(run)
     from emb_bench.recordings.recording import open_recording
 
