@@ -11,6 +11,7 @@ from typing import Any
 from emb_bench.output import replacing
 from emb_runtime.errors import needs
 
+PICTURES = (".png", ".svg", ".pdf")  # Endings of a picture
 # Blue, orange, green, pink, sky, yellow of Okabe and Ito: distinguishable by colour-blind eyes too.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 GREY = "#888888"

@@ -13,7 +13,7 @@ from emb_bench.api.runs import Run, delete_with, open_run
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.experiment.experiment import planned
-from emb_bench.sim.simulated_brake import NOISES, brake_of
+from emb_bench.sim.simulated_brake import CONDITIONS, NOISES, brake_of
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError, needs
 
@@ -37,7 +37,7 @@ def simulate(
         log: MCAP file to write; must not exist (default: a temporary one, which is deleted with the run).
         plant: name of one of the bench's plants.
         parameters: true parameters by name; the others are nominal. So are ``angle_noise`` [rad] and
-            ``velocity_noise`` [rad/s].
+            ``velocity_noise`` [rad/s]; ``temperature`` [degC] with ``supply_voltage`` [V] are sent along.
         seed: of the sensors' noise.
         currents: requested in place of a policy, one per sample period [A].
         policy: ONNX file, or currents (default: the shipped actor).
@@ -63,7 +63,7 @@ def simulate(
         currents, policy = policy, None
     if currents is not None and (policy is not None or quick):
         raise UsageError("currents: expected them without policy and without quick")
-    require_options("simulate", more_parameters, (*PARAMETER_NAMES, *NOISES, *_OPTIONS))
+    require_options("simulate", more_parameters, (*PARAMETER_NAMES, *NOISES, *CONDITIONS, *_OPTIONS))
     brake = {"plant": plant, "seed": seed, **(parameters or {}), **more_parameters}
     own = Path(mkdtemp(prefix="emb-run-")) if log is None else None
     path = Path(log or f"{own}/run.mcap")

@@ -12,12 +12,14 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path, PurePath
 
+from emb_bench.batch.chart import draw_chart
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import ENDINGS as ROWS
 from emb_bench.batch.row import CampaignOptions, Row, Source, failed, write_rows
 from emb_bench.batch.summary import Campaign, mark_copies, summarise
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import DEFAULT_PLANT
+from emb_bench.figures import PICTURES
 from emb_bench.output import progress, replacing, require_place
 from emb_bench.parallel import Lost, processors, shared_out, shared_out_on_ray
 from emb_runtime.errors import UsageError, needs
@@ -37,6 +39,8 @@ def run_campaign(paths: Sequence[Path], output: Path, options: CampaignOptions) 
         options.question(its)
         options = replace(options, bench_text=its.text)
     require_place("--output", output, ROWS)
+    chart = None if options.chart is None else Path(options.chart)
+    require_place("--chart", chart, PICTURES)
     with needs("a campaign", "bench"):
         import numba  # noqa: F401
         import pyarrow  # noqa: F401
@@ -50,6 +54,8 @@ def run_campaign(paths: Sequence[Path], output: Path, options: CampaignOptions) 
             numbered = shared_out_on_ray(evaluate, sources, options.jobs, limit, options.ray)
         rows = mark_copies(in_order(sources, numbered))
         write_rows(beside, output.suffix.lower(), rows, options)
+    if chart is not None and not draw_chart(rows, options.names, chart):
+        mention(f"{chart}: not drawn: no run that the model fits identifies a parameter")
     return summarise(rows, options, str(output))
 
 

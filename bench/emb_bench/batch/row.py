@@ -47,11 +47,20 @@ class CampaignOptions(SearchOptions):
         "address of a Ray cluster, or 'local' for a Ray of this machine (default: processes of this machine)",
         "ADDRESS",
     )
+    chart: str | Path | None = option(
+        None,
+        "picture to write, .png, .svg or .pdf: each parameter against time, temperature and supply voltage, with control "
+        "limits",
+        "FILE",
+        kind=Path,
+    )
     bench_text: str | None = None  # Text of the bench file, which other machines do not have; None of each log's own
 
     def __post_init__(self) -> None:
         """Check all that needs no bench."""
         super().__post_init__()
+        if self.chart is not None and self.method == NONE:
+            raise UsageError(f"--chart: expected estimates to draw, and --method is '{NONE}'")
         if not 1e-3 <= self.time_limit <= 1e6:
             raise UsageError(f"--time-limit: expected 0.001 to 1e6 s, got {self.time_limit:g}")
 

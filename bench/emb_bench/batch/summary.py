@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from emb_bench.analysis.several_runs import Constancy, Slope, beyond, constancy, slope
 from emb_bench.batch.row import NONE, CampaignOptions, Row, unit_of
@@ -123,24 +124,35 @@ def _parameter(rows: Sequence[Row], name: str) -> ParameterSummary:
         identified=sum(bool(row.get(f"{name}_identified")) for row in rows),
         cramer_rao=float(np.median(bounds)) if bounds else None,
         relative=PARAMETERS[name].relative,
-        estimate=_estimates([row for row in rows if _is_usable(row, name)], name),
+        estimate=_estimates([row for row in rows if is_usable(row, name)], name),
     )
 
 
-def _is_usable(row: Row, name: str) -> bool:
+def is_usable(row: Row, name: str) -> bool:
     """True if the estimate has a valid deviation: the model explains the record, which identifies the parameter."""
     deviation = row.get(f"{name}_between_runs")
     return bool(row.get("fits") and row[f"{name}_identified"]) and deviation is not None and 0.0 < deviation < math.inf
 
 
+def _columns(used: Sequence[Row], name: str) -> dict[str, NDArray[np.float64]]:
+    """Columns of a parameter, by name; the deviation between runs in SI units."""
+    found = {key: np.array([row.get(f"{name}_{key}") for row in used], np.float64) for key in OF_AN_ESTIMATE}
+    if PARAMETERS[name].relative:  # shares are of one number, so that what came out small weighs no more
+        found["between_runs"] *= abs(float(np.median(found["estimate"])))
+    return found
+
+
+def measured(used: Sequence[Row], name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Estimates of a parameter and their deviations between runs, SI units."""
+    found = _columns(used, name)
+    return found["estimate"], found["between_runs"]
+
+
 def _estimates(used: Sequence[Row], name: str) -> ParameterEstimates | None:
     if not used:
         return None
-    found = {key: np.array([row.get(f"{name}_{key}") for row in used], np.float64) for key in OF_AN_ESTIMATE}
-    values = found["estimate"]
-    # Shares are of one number, so that what came out small weighs no more.
-    scale = abs(float(np.median(values))) if PARAMETERS[name].relative else 1.0
-    deviations = (scale * found["between_runs"]).tolist()
+    found = _columns(used, name)
+    values, deviations = found["estimate"], found["between_runs"].tolist()
     over = {}
     for key, (factor, _) in CONDITIONS.items():
         known = [i for i, row in enumerate(used) if row.get(key) is not None]

@@ -51,7 +51,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--brake", default="", metavar="plant=stribeck,f_v=3e-5,...",
         help="as for `emb-run --iface sim:`: one of the bench's plants, true parameters (default: nominal), seed (1), "
-        "angle_noise, velocity_noise (the bench file's), charge=1: send the integral of the current along",
+        "angle_noise, velocity_noise (the bench file's), charge=1: send the integral of the current along, "
+        "temperature [degC] with supply_voltage [V]: send them along",
     )  # fmt: skip
     p.add_argument("--duration", type=float, metavar="S", help="seconds to run (default: until stopped)")
     p.add_argument("--no-rt", action="store_true", help="leave scheduling and memory alone")
@@ -115,7 +116,9 @@ def _run(args: argparse.Namespace) -> int:
     layout = load_layout()
     transport, clock = open_transport(args.iface, bench, (layout.command.identifier,))
     try:
-        node = BrakeNode(bench, layout, brake.theta, brake.noise, brake.plant, charge=brake.charge)
+        node = BrakeNode(
+            bench, layout, brake.theta, brake.noise, brake.plant, charge=brake.charge, conditions=brake.conditions
+        )
         if not args.no_rt:
             realtime.obtain(priority=PRIORITY)
         parameters = ", ".join(f"{name} = {plain(value, 6)}" for name, value in brake.theta._asdict().items())

@@ -16,8 +16,8 @@ from emb_bench.export.dcm import write_dcm
 from emb_bench.export.fmu import write_fmu
 from emb_bench.export.identified import identified
 from emb_bench.export.mjcf import write_mjcf
-from emb_bench.export.picture import ENDINGS as PICTURES
 from emb_bench.export.picture import draw_run
+from emb_bench.figures import PICTURES
 from emb_bench.logs.log import UNIX_TIME, RunLog
 from emb_bench.logs.mcap_file import Column
 from emb_bench.output import replacing, require_place, text_cells

@@ -14,7 +14,6 @@ from emb_bench.logs.log import RunLog
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.records import NodeState, Reason, RunState
 
-ENDINGS = (".png", ".svg", ".pdf")
 ROWS = 5  # Axes of a picture, one above the other
 CURRENTS = (  # field, label, colour, width, period after or before the sample; what is drawn last lies on top
     ("policy_current", "requested", COLOURS[4], 3.5, "post"),

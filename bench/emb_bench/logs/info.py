@@ -69,6 +69,10 @@ def info_document(log: RunLog) -> dict[str, Any]:
         "estimate": (estimate := last_estimate(log)),
         "total": total(shares(estimate), known_errors(log)),
         "drive_lacks": log.drive_lacks,
+        "conditions": {
+            name: {"min": float(values.min()), "max": float(values.max())}
+            for name, values in log.measured_conditions.items()
+        },
         "largest": found.largest and asdict(found.largest),
         "sensor_to_command": found.sensor_to_command,
     }

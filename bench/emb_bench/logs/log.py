@@ -48,6 +48,9 @@ from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.system import terminal
 from emb_runtime.system.input_file import open_regular
 
+CONDITIONS = {"temperature": ("Temperature", "°C"), "supply_voltage": ("SupplyVoltage", "V")}
+"""Conditions of a run that a node may send: signal of ``EMB_Conditions``, and unit."""
+
 Table = Mapping[str, NDArray[Any]]
 """One topic: its fields as columns, ``publish_time`` and ``log_time`` [Unix ns], and ``order`` in the file."""
 
@@ -351,13 +354,18 @@ class RunLog:
     @cached_property
     def conditions(self) -> Mapping[str, float]:
         """Mean temperature of the motor [degC] and supply voltage [V], by name; what no frame says is left out."""
-        found, topic = dict[str, float](), "/emb/EMB_Conditions"
-        for name, signal in {"temperature": "Temperature", "supply_voltage": "SupplyVoltage"}.items():
+        return {name: float(values.mean()) for name, values in self.measured_conditions.items()}
+
+    @cached_property
+    def measured_conditions(self) -> Mapping[str, NDArray[np.float64]]:
+        """Values that :attr:`conditions` are the means of, in the order of their frames, by name."""
+        found, topic = dict[str, NDArray[np.float64]](), "/emb/EMB_Conditions"
+        for name, (signal, _) in CONDITIONS.items():
             values = np.asarray(self.tables[topic].get(signal, ()), np.float64) if topic in self.topics else np.empty(0)
             one = load_layout().conditions.signal(signal)
             known = values[(values >= one.minimum) & (values <= one.maximum)]  # this way round, NaN is none
             if known.size:
-                found[name] = float(known.mean())
+                found[name] = known
         return found
 
     @cached_property

@@ -17,6 +17,7 @@ from emb_bench.documents import to_json
 from emb_bench.estimate.records import DONE, METHODS
 from emb_bench.logs import timing
 from emb_bench.logs.info import info_document
+from emb_bench.logs.log import CONDITIONS
 from emb_bench.logs.timing import INTERVALS, Timing, quantiles
 from emb_bench.numbers import p_value, seconds, signed
 from emb_bench.report import figures, tables
@@ -276,7 +277,7 @@ def _parameters(study: Study) -> list[Block | None]:
 def _signature(study: Study) -> Facts:
     """Lines to be signed; temperature and supply as the nodes sent them, the mean of the runs."""
     logs, told = [run.log.conditions for run in study.used or study.runs], list[str]()
-    for name, unit in (("temperature", "°C"), ("supply_voltage", "V")):
+    for name, (_, unit) in CONDITIONS.items():
         if values := [one[name] for one in logs if name in one]:
             told.append(f"{plain(sum(values) / len(values), 4)} {unit}")
     return Facts([("Temperature, supply", ", ".join(told)), *BLANK], "signature")

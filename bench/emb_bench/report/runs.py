@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from emb_bench.config.bench import COUNTED, QUANTILE_NAMES
-from emb_bench.logs.log import RunLog, end_detail
+from emb_bench.logs.log import CONDITIONS, RunLog, end_detail
 from emb_bench.logs.timing import INTERVALS, BudgetCheck, Timing, document, judge, quantiles, timing
 from emb_bench.numbers import percent, seconds
 from emb_bench.report.text import Table, facts, listed, wrapped
@@ -37,6 +37,7 @@ def info(d: Mapping[str, Any], *, verbose: bool = False) -> str:
         ("cycles", f"{cycles}, {c['missed_periods']} periods missed"),
         ("commands", f"{commands}, {c['left']} braked by the node"),
         ("extremes", _largest(d.get("largest"))),
+        *((name.partition("_")[0], _between(name, ends)) for name, ends in d.get("conditions", {}).items()),
         *(("drive lacks", f"{name}: {lost}") for name, lost in d.get("drive_lacks", {}).items()),
         ("response", _delays(d)),
     )
@@ -74,6 +75,11 @@ def _largest(largest: Mapping[str, float] | None) -> str:
         f"angle {plain(largest['angle_min'], 4)} to {plain(largest['angle_max'], 4)} rad, "
         f"speed {largest['speed']:.1f} rad/s, current {largest['current']:.3f} A"
     )
+
+
+def _between(name: str, ends: Mapping[str, float]) -> str:
+    """A condition's least and largest value, with its unit."""
+    return f"{plain(ends['min'], 4)} to {plain(ends['max'], 4)} {CONDITIONS[name][1]}"
 
 
 def _listed(title: str, entries: Mapping[str, str]) -> list[str]:

@@ -52,7 +52,7 @@ class Rest:
 
 
 class BrakeNode(SimulatedBrake):
-    """A brake with its drive and sensors on the bus; on request it sends the charge before each sample."""
+    """A brake with its drive and sensors on the bus; on request it sends the charge before each sample, and conditions."""
 
     def __init__(
         self,
@@ -63,6 +63,7 @@ class BrakeNode(SimulatedBrake):
         plant: Plant | None = None,
         *,
         charge: bool = False,
+        conditions: tuple[float, ...] = (),
     ) -> None:
         super().__init__(theta, noise, plant or BUILT_IN[DEFAULT_PLANT], bench.timing.sample_time)
         self._bench = bench
@@ -72,6 +73,7 @@ class BrakeNode(SimulatedBrake):
         self._check = CounterCheck(COUNTER_MODULUS)
         self._status = 0, 1  # counter of the next status, and the period from which on it is due
         self._charge = 0.0 if charge else None
+        self._conditions = conditions  # temperature [degC] and supply voltage [V]; empty if they are not sent
         self._command: CurrentCommand | None = None
         self._idle_periods = 0
         self._rest = Rest(0.0)
@@ -183,4 +185,6 @@ class BrakeNode(SimulatedBrake):
         if self.periods >= due:
             self._status = next_counter(number), self.periods + STATUS_PERIODS
             frames.append(layout.encode_status(number, self.state, self.stop_reason, self.rejected, self._identity))
+            if self._conditions:
+                frames.append(layout.encode_conditions(number, *self._conditions))
         return frames

@@ -19,6 +19,7 @@ from emb_bench.brake.motion import Floats, Integers, advance, no_sensitivity, re
 from emb_bench.config.bench import with_tables
 from emb_bench.config.plants import DEFAULT_PLANT, Instruments, Mechanics, Plant
 from emb_bench.sim.instruments import MEMORY, command, measure, settle
+from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.config.bench import Noise as SensorNoise
 from emb_runtime.errors import UsageError, near
@@ -127,6 +128,7 @@ class SimulatedBrake:
 
 
 NOISES = ("angle_noise", "velocity_noise")  # Options for sensors that are not as the bench file says
+CONDITIONS = {"temperature": "Temperature", "supply_voltage": "SupplyVoltage"}  # Options, and signals of their frame
 LONGEST_SEED = 18  # Digits of a seed
 FARTHEST = 100.0  # A brake that is farther from nominal, by this factor, is a typing error
 
@@ -177,6 +179,7 @@ class BrakeToSimulate(NamedTuple):
     noise: Noise
     seed: int
     charge: bool  # The node sends the integral of its current along
+    conditions: tuple[float, ...] = ()  # Temperature [degC] and supply voltage [V] that it sends; none if empty
 
     @property
     def truth(self) -> dict[str, float | str]:
@@ -188,7 +191,8 @@ def read_brake(text: str, bench: Bench, option: str) -> BrakeToSimulate:
     """Reads ``plant=exact,seed=3,f_v=3e-5``; what is not given is the default plant, seed 1, nominal.
 
     ``charge=1`` has the node send the integral of its current; ``angle_noise`` [rad] and ``velocity_noise`` [rad/s] are
-    standard deviations of sensors that are not as the bench file says. ``option`` begins a message.
+    standard deviations of sensors that are not as the bench file says; ``temperature`` [degC] and ``supply_voltage`` [V]
+    have the node send them. ``option`` begins a message.
     """
     return brake_of(parse_assignments(text, option), bench, option)
 
@@ -203,14 +207,15 @@ def brake_of(options: Mapping[str, Any], bench: Bench, option: str) -> BrakeToSi
     if charge not in ("0", "1"):
         raise UsageError(f"{option}charge: expected 0 or 1, got '{charge}'")
     angle, velocity = (_deviation(given, name, option) for name in NOISES)
+    conditions = _conditions(given, option)
     sensors = replace(
         bench.noise,
         angle=bench.noise.angle if angle is None else angle,
         velocity=bench.noise.velocity if velocity is None else velocity,
     )
-    theta = true_parameters(bench, given, ("plant", "seed", "charge", *NOISES), option)
+    theta = true_parameters(bench, given, ("plant", "seed", "charge", *NOISES, *CONDITIONS), option)
     noise = gaussian_noise(sensors, seed, plant.instruments.clock_jitter)
-    return BrakeToSimulate(theta, plant, noise, seed, charge == "1")
+    return BrakeToSimulate(theta, plant, noise, seed, charge == "1", conditions)
 
 
 def _number(given: Any) -> float:
@@ -239,6 +244,19 @@ def _deviation(given: dict[str, Any], name: str, option: str) -> float | None:
     if not 0.0 <= value < math.inf:
         raise UsageError(f"{option}{name}: expected a standard deviation from 0 on, got '{told}'")
     return value
+
+
+def _conditions(given: dict[str, Any], option: str) -> tuple[float, ...]:
+    """Temperature [degC] and supply voltage [V], or nothing: one frame carries both."""
+    told = {name: given.pop(name) for name in CONDITIONS if name in given}
+    for name, text in told.items():
+        signal = load_layout().conditions.signal(CONDITIONS[name])
+        if not signal.minimum <= _number(text) <= signal.maximum:  # this way round, NaN is refused
+            raise UsageError(f"{option}{name}: expected {signal.range_text}, got '{text}'")
+    if len(told) == 1:
+        other = next(name for name in CONDITIONS if name not in told)
+        raise UsageError(f"{option}{other}: missing; one frame carries {' and '.join(CONDITIONS)}: give both")
+    return tuple(_number(told[name]) for name in CONDITIONS if name in told)
 
 
 def gaussian_noise(sensors: SensorNoise, seed: int, clock_jitter: float = 0.0) -> Noise:

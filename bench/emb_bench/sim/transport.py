@@ -105,7 +105,9 @@ def open_sim(options: str, bench: Bench) -> tuple[SimTransport, SteppedClock]:
 
 def open_brake(brake: BrakeToSimulate, bench: Bench) -> tuple[SimTransport, SteppedClock]:
     """Open a bus with a simulated brake on it."""
-    node = BrakeNode(bench, load_layout(), brake.theta, brake.noise, brake.plant, charge=brake.charge)
+    node = BrakeNode(
+        bench, load_layout(), brake.theta, brake.noise, brake.plant, charge=brake.charge, conditions=brake.conditions
+    )
     # Monotonic time starts where the computer's stands, so that a log has the date of its run.
     now_ns = time.monotonic_ns()
     clock = SteppedClock(now_ns, time.time_ns() - now_ns)

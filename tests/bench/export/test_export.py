@@ -19,7 +19,8 @@ from emb_bench.cli.replay import main
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.export.export import TABLES
 from emb_bench.export.mjcf import mjcf
-from emb_bench.export.picture import ENDINGS, broken, draw_run
+from emb_bench.export.picture import broken, draw_run
+from emb_bench.figures import PICTURES
 from emb_bench.logs.log import RunLog, read_log
 from emb_runtime.config.bench import load_bench
 from emb_runtime.log.ring_buffer import EventRecord
@@ -173,7 +174,7 @@ def test_no_line_is_drawn_through_periods_that_were_missed() -> None:
 def test_an_incomplete_log_is_exported_with_a_warning_first(path: Path, tmp_path: Path, replay: Replay) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(path.read_bytes()[:-5])
-    for ending in (*ENDINGS, *TABLES):
+    for ending in (*PICTURES, *TABLES):
         out = tmp_path / f"out{ending}"
         said = replay.text("export", cut, "-o", out).splitlines()
         assert said[0].startswith("WARNING: the file is cut at byte")

@@ -59,6 +59,23 @@ def test_they_go_from_the_bus_to_log_campaign_and_certificate(
     assert "41.5 °C" not in " ".join(make(tmp_path / "plain.html", plain, "--starts", "1").reader.texts)
 
 
+def test_a_simulated_node_sends_them_on_request_and_no_other_frame_changes(
+    tmp_path: Path, simulate: Simulate, replay: Replay
+) -> None:
+    plain, telling = (
+        write_log(tmp_path / f"{n}.mcap", simulate(square, options=f"plant=exact,seed=5{more}"))
+        for n, more in enumerate(("", ",temperature=65,supply_voltage=12.8"))
+    )
+    frames = [[(f.identifier, f.data) for f in read_log(path).frames] for path in (plain, telling)]
+    own = LAYOUT.conditions.identifier
+    assert [f for f in frames[1] if f[0] != own] == frames[0]
+    periods = sum(f[0] == LAYOUT.angle.identifier for f in frames[1])
+    assert sum(f[0] == own for f in frames[1]) == pytest.approx(periods / 100, abs=1.0)
+    shown = replay.text("info", telling).splitlines()
+    assert {"temperature  65 to 65 °C", "supply       12.8 to 12.8 V"} <= set(shown)
+    assert "temperature" not in replay.text("info", plain)
+
+
 def test_a_slope_over_a_condition_is_that_of_weighted_least_squares() -> None:
     found = slope([1.0, 2.0, 3.5, 3.9], [0.1, 0.1, 0.2, 0.1], [20.0, 30.0, 45.0, 50.0])
     assert found is not None

@@ -1,0 +1,67 @@
+"""A control chart: each parameter of a campaign's runs against time and conditions, with limits from its deviation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.analysis.several_runs import BEYOND, beyond, slope
+from emb_bench.batch.row import Row, unit_of
+from emb_bench.batch.summary import CONDITIONS, is_usable, measured
+from emb_bench.brake.parameters import PARAMETERS
+from emb_bench.figures import COLOURS, DASHED, drawn
+
+Floats = NDArray[np.float64]
+
+
+def draw_chart(rows: Sequence[Row], names: Sequence[str], path: Path) -> bool:
+    """Draw what is estimated, one row of axes a parameter, one column a condition; False if nothing is.
+
+    As in the summary, copies of a log and runs that the model does not fit are left out.
+    """
+    counted = [row for row in rows if row["error"] is None and row.get("copy_of") is None]
+    used = {name: found for name in names if (found := [row for row in counted if is_usable(row, name)])}
+    if not used:
+        return False
+    shown = [key for key in CONDITIONS if any(row.get(key) is not None for found in used.values() for row in found)]
+    begun = min(row["start_time"] for found in used.values() for row in found)
+    title = f"Control chart; dashed: median ± {BEYOND:g} standard deviations between runs, of each run"
+    size = (0.8 + 3.4 * len(shown), 0.8 + 1.7 * len(used))
+    with drawn(path, len(used), len(shown), title, size, sharex="col", sharey="row") as axes:
+        for name, line in zip(used, axes, strict=True):
+            values, deviations = measured(used[name], name)
+            for key, axis in zip(shown, line, strict=True):
+                known = [i for i, row in enumerate(used[name]) if row.get(key) is not None]
+                zero, factor = begun if key == "start_time" else 0, CONDITIONS[key][0]
+                at = np.array([factor * (used[name][i][key] - zero) for i in known], np.float64)
+                _draw(axis, name, at, values, deviations, known)
+        for key, axis in zip(shown, axes[-1], strict=True):
+            label = "time since the first run" if key == "start_time" else key.replace("_", " ")
+            axis.set_xlabel(f"{label} [{CONDITIONS[key][1]}]")
+    return True
+
+
+def _draw(axis: Any, name: str, at: Floats, values: Floats, deviations: Floats, known: Sequence[int]) -> None:
+    """One parameter against one condition, which the ``known`` runs have; a line where the slope is significant."""
+    median, out = float(np.median(values)), np.isin(known, beyond(values.tolist(), deviations.tolist()))
+    reference, factor, label = 0.0, 1.0, f"{name} [{unit_of(name, 'SI')}]"
+    if PARAMETERS[name].relative:
+        reference, factor, label = median, 100.0 / abs(median), f"{name} − median [%]"
+    y, limit, order = values[known], BEYOND * deviations[known], np.argsort(at, kind="stable")
+    for side in (-1.0, 1.0):
+        axis.plot(at[order], factor * (median + side * limit[order] - reference), marker="_", **DASHED)
+    axis.axhline(factor * (median - reference), **DASHED | {"linestyle": "-"})
+    for where, marker, colour in ((~out, "o", COLOURS[0]), (out, "X", COLOURS[1])):
+        axis.plot(at[where], factor * (y[where] - reference), marker, color=colour, markersize=4.5)
+    found = slope(y.tolist(), deviations[known].tolist(), at.tolist())
+    if found is not None and found.significant:
+        weights = deviations[known] ** -2.0
+        ends = np.array([at.min(), at.max()])
+        middle = (np.average(at, weights=weights), np.average(y, weights=weights))
+        axis.plot(ends, factor * (middle[1] + found.slope * (ends - middle[0]) - reference), color=COLOURS[2])
+    if axis.get_subplotspec().is_first_col():
+        axis.set_ylabel(label)
