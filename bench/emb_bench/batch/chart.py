@@ -30,7 +30,7 @@ def draw_chart(rows: Sequence[Row], names: Sequence[str], path: Path) -> bool:
     shown = [key for key in CONDITIONS if any(row.get(key) is not None for found in used.values() for row in found)]
     begun = min(row["start_time"] for found in used.values() for row in found)
     title = f"Control chart; dashed: median ± {BEYOND:g} standard deviations between runs, of each run"
-    size = (0.8 + 3.4 * len(shown), 0.8 + 1.7 * len(used))
+    size = (max(6.5, 0.8 + 3.4 * len(shown)), 0.8 + 1.7 * len(used))
     with drawn(path, len(used), len(shown), title, size, sharex="col", sharey="row") as axes:
         for name, line in zip(used, axes, strict=True):
             values, deviations = measured(used[name], name)
@@ -41,6 +41,7 @@ def draw_chart(rows: Sequence[Row], names: Sequence[str], path: Path) -> bool:
                 _draw(axis, name, at, values, deviations, known)
         for key, axis in zip(shown, axes[-1], strict=True):
             label = "time since the first run" if key == "start_time" else key.replace("_", " ")
+            axis.locator_params(axis="x", nbins=5)
             axis.set_xlabel(f"{label} [{CONDITIONS[key][1]}]")
     return True
 

@@ -49,8 +49,8 @@ class CampaignOptions(SearchOptions):
     )
     chart: str | Path | None = option(
         None,
-        "picture to write, .png, .svg or .pdf: each parameter against time, temperature and supply voltage, with control "
-        "limits",
+        "picture to write, .png, .svg or .pdf: each parameter against time, temperature and supply voltage, with "
+        "control limits",
         "FILE",
         kind=Path,
     )

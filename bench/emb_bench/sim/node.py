@@ -52,7 +52,7 @@ class Rest:
 
 
 class BrakeNode(SimulatedBrake):
-    """A brake with its drive and sensors on the bus; on request it sends the charge before each sample, and conditions."""
+    """A brake with its drive and sensors on the bus; on request it sends charge and conditions along."""
 
     def __init__(
         self,

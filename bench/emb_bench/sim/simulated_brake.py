@@ -191,8 +191,8 @@ def read_brake(text: str, bench: Bench, option: str) -> BrakeToSimulate:
     """Reads ``plant=exact,seed=3,f_v=3e-5``; what is not given is the default plant, seed 1, nominal.
 
     ``charge=1`` has the node send the integral of its current; ``angle_noise`` [rad] and ``velocity_noise`` [rad/s] are
-    standard deviations of sensors that are not as the bench file says; ``temperature`` [degC] and ``supply_voltage`` [V]
-    have the node send them. ``option`` begins a message.
+    standard deviations of sensors that are not as the bench file says. ``temperature`` [degC] with ``supply_voltage``
+    [V] has the node send them. ``option`` begins a message.
     """
     return brake_of(parse_assignments(text, option), bench, option)
 

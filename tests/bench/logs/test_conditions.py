@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
+from matplotlib import rc_context
 from pyarrow import parquet
 
 from emb_bench.analysis.several_runs import beyond, slope
+from emb_bench.batch.chart import draw_chart
+from emb_bench.batch.row import Row
 from emb_bench.logs.log import read_log
 from emb_runtime.can.messages import load_layout
 from emb_runtime.records import Frame
@@ -74,6 +78,34 @@ def test_a_simulated_node_sends_them_on_request_and_no_other_frame_changes(
     shown = replay.text("info", telling).splitlines()
     assert {"temperature  65 to 65 °C", "supply       12.8 to 12.8 V"} <= set(shown)
     assert "temperature" not in replay.text("info", plain)
+
+
+def rows_of(values: list[float]) -> list[Row]:
+    return [
+        {
+            "log": f"{n}.mcap",
+            "error": None,
+            "fits": True,
+            "start_time": n * 3_600_000_000_000,
+            "temperature": 20.0 + n,
+            "k_m_identified": False,
+            "f_v_identified": True,
+            "f_v_estimate": value,
+            "f_v_between_runs": 0.01,
+        }
+        for n, value in enumerate(values)
+    ]
+
+
+def test_a_chart_has_the_conditions_that_were_sent_the_limits_and_the_runs_beyond_them(tmp_path: Path) -> None:
+    path = tmp_path / "chart.svg"
+    with rc_context({"svg.fonttype": "none"}):
+        assert draw_chart(rows_of([2.0, 2.01, 1.99, 2.0, 2.2]), ["k_m", "f_v"], path)
+    shown = " ".join(ElementTree.parse(path).getroot().itertext())
+    assert all(text in shown for text in ("time since the first run [h]", "temperature [°C]", "f_v − median [%]"))
+    assert not any(text in shown for text in ("supply voltage", "k_m"))
+    assert not draw_chart([row | {"fits": False} for row in rows_of([2.0])], ["f_v"], tmp_path / "none.png")
+    assert not (tmp_path / "none.png").exists()
 
 
 def test_a_slope_over_a_condition_is_that_of_weighted_least_squares() -> None:
