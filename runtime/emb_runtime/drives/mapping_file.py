@@ -42,7 +42,7 @@ MOST_STEPS = 16  # Steps of a sequence, and frames of a step
 UNITS = {
     "rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi,
     "rad/s": 1.0, "deg/s": math.pi / 180.0, "rev/s": 2.0 * math.pi, "rpm": 2.0 * math.pi / 60.0,
-    "A": 1.0, "mA": 1e-3,
+    "A": 1.0, "mA": 1e-3, "degC": 1.0, "V": 1.0, "mV": 1e-3,
 }  # fmt: skip
 """SI units per unit; of Nm and per_mille ``per_ampere`` make one ampere."""
 
@@ -86,6 +86,18 @@ class _Current(_Signal, kw_only=True):
     per_ampere: Positive | None = None
 
 
+class _Temperature(_Signal, kw_only=True):
+    unit: Literal["degC"]
+    sign: Literal[1] = 1
+    offset: float = 0.0
+
+
+class _SupplyVoltage(_Signal, kw_only=True):
+    unit: Literal["V", "mV"]
+    sign: Literal[1] = 1
+    offset: float = 0.0
+
+
 class _Command(_Signal, kw_only=True):
     unit: Literal["A", "mA", "Nm", "per_mille"]
     per_ampere: Positive | None = None
@@ -109,6 +121,8 @@ class _Signals(Struct, kw_only=True):
     ]
     current: _Current | None = None
     state: _State | None = None
+    temperature: _Temperature | None = None
+    supply_voltage: _SupplyVoltage | None = None
 
 
 class _Wait(Struct, kw_only=True):
@@ -216,6 +230,11 @@ def _made(file: _File, text: str, dbc_text: str, source: str) -> Mapping:
         velocity=reader.measured(signals.velocity, "can.signals.velocity"),
         sensors=Sensors("sensor" if known == (None, None) else "observer", *known),
         current=None if signals.current is None else reader.measured(signals.current, "can.signals.current"),
+        conditions={
+            name: reader.measured(of, f"can.signals.{name}")
+            for name, of in (("temperature", signals.temperature), ("supply_voltage", signals.supply_voltage))
+            if of is not None
+        },
         command=command,
         state=state,
         arm=tuple(reader.step(step, f"can.arm[{n}]", command, state) for n, step in enumerate(can.arm)),
@@ -269,7 +288,7 @@ class _Reader:
     def error(self, key: str, reason: str) -> MappingError:
         return MappingError(f"{self._source}: {key}: {reason}")
 
-    def measured(self, of: _Angle | _Velocity | _Current, key: str) -> Measured:
+    def measured(self, of: _Angle | _Velocity | _Current | _Temperature | _SupplyVoltage, key: str) -> Measured:
         info, field = self._signal(of.signal, key)
         wrap = of.wrap or 0.0 if isinstance(of, _Angle) else 0.0
         low, high = self._range(of, key)
@@ -402,7 +421,7 @@ class _Reader:
         )
         return info
 
-    def _scale(self, of: _Angle | _Velocity | _Current | _Command, key: str) -> float:
+    def _scale(self, of: _Angle | _Velocity | _Current | _Temperature | _SupplyVoltage | _Command, key: str) -> float:
         """SI units per DBC unit."""
         if not _is_torque(of.unit):
             return of.sign * of.scale * UNITS[of.unit]

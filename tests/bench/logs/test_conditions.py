@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
@@ -15,12 +16,15 @@ from emb_bench.batch.chart import draw_chart
 from emb_bench.batch.row import Row
 from emb_bench.logs.log import read_log
 from emb_runtime.can.messages import load_layout
+from emb_runtime.log.recorder_process import LogWriter
+from emb_runtime.log.ring_buffer import Attachment, FrameRecord, LogHeader
 from emb_runtime.records import Frame
 
 from tests.bench.conftest import Replay  # isort: skip
 from tests.bench.report_pages import make  # isort: skip
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.conftest import Simulate  # isort: skip
+from tests.drives import EXAMPLES  # isort: skip
 from tests.independent import protected  # isort: skip
 
 LAYOUT = load_layout()
@@ -78,6 +82,41 @@ def test_a_simulated_node_sends_them_on_request_and_no_other_frame_changes(
     shown = replay.text("info", telling).splitlines()
     assert {"temperature  65 to 65 °C", "supply       12.8 to 12.8 V"} <= set(shown)
     assert "temperature" not in replay.text("info", plain)
+
+
+def test_a_mapped_drive_s_own_signals_are_read_from_its_bus_where_they_can_be_believed(tmp_path: Path) -> None:
+    toml, dbc = ((EXAMPLES / f"vesc.{kind}").read_text() for kind in ("toml", "dbc"))
+    line = next(row for row in toml.splitlines() if row.startswith("temperature"))
+    voltage = line.replace("temperature", "supply_voltage").replace('"degC"', '"mV"').replace("Temp_Motor", "Temp_FET")
+    status_4 = Frame(0x1005, b"", extended=True)
+    told = [(120, 412), (130, 432), (140, 2001), (-401, -401)]  # tenths; the last two are beyond the range, or half so
+    frames = [status_4._replace(data=struct.pack(">hhhh", *pair, 0, 0)) for pair in told]
+    frames += [frames[0]._replace(data=frames[0].data[:7]), frames[0]._replace(extended=False, identifier=5)]
+    for given, expected in (
+        (toml, {"temperature": 42.2}),
+        (toml.replace(line, f"{line}\n{voltage}"), {"temperature": 42.2, "supply_voltage": 0.013}),
+        (toml.replace(line, ""), {}),
+    ):
+        header = LogHeader(
+            start_ns=0,
+            wall_offset_ns=0,
+            simulated=True,
+            dbc=LAYOUT.text,
+            messages=LAYOUT.known,
+            metadata={"emb.run": {}, "emb.drive": {"bus": "can0", "lost": ""}},
+            attachments=[
+                Attachment("drive.toml", "application/toml", given.encode()),
+                Attachment("drive.dbc", "text/plain", dbc.encode()),
+            ],
+            drive_bus="can0",
+        )
+        path = tmp_path / "drive.mcap"
+        with path.open("wb") as file:
+            writer = LogWriter(file, header)
+            for n, frame in enumerate(frames):
+                writer.write_frame("/drive/rx", FrameRecord(frame._replace(time_ns=n)), n)
+            writer.finish({"exit_reason": "DONE"})
+        assert read_log(path).conditions == pytest.approx(expected)
 
 
 def rows_of(values: list[float]) -> list[Row]:
