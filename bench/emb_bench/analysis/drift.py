@@ -114,6 +114,16 @@ def read_last(path: Path) -> Earlier:
         ) from err
 
 
+def earlier(e: Estimate, record: str) -> Earlier:
+    """An estimate of one record, by its name, as the earlier one of a comparison."""
+    between = e.between_runs().tolist()
+    entries = {
+        e.labels[i]: Entry(float(e.values[i]), e.unknowns[i].relative, between[i], dict(e.effects(i)))
+        for i in e.wanted()
+    }
+    return Earlier(entries, e.plant.name, e.validation.fits, (Named(record),))
+
+
 def drifts(now: Estimate, last: Earlier) -> tuple[Drift, ...]:
     """Compare what all records share with an earlier estimate, as far as both have it."""
     then = last.parameters

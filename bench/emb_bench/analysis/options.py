@@ -165,6 +165,14 @@ class ReportOptions(EstimateOptions):
     junit: str | Path | None = option(
         None, "XML file to write with the results of the acceptance criteria as test cases", "FILE", kind=Path
     )
+    compare: bool = option(False, "two runs side by side, each estimated alone, and their differences")
+
+    def __post_init__(self) -> None:
+        """Refuse what needs one estimate beside a comparison of two."""
+        super().__post_init__()
+        asked = [f"--{name}" for name in ("last", "acceptance", "junit") if getattr(self, name) is not None]
+        if self.compare and asked:
+            raise UsageError(f"--compare: expected it without {' and '.join(asked)}: report each run alone for these")
 
 
 def names_of(names: Names) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from emb_bench.analysis.conclusion import Conclusion, conclude
-from emb_bench.analysis.drift import Earlier, drifts
+from emb_bench.analysis.drift import Earlier, drifts, earlier
 from emb_bench.analysis.held_out import apart, leave_one_out
 from emb_bench.analysis.model_choice import choose_model
 from emb_bench.analysis.options import EstimateOptions
@@ -58,6 +58,24 @@ def make_study(
     single = replace(options, profile=False)
     alone = (run if run.why_not else replace(run, alone=_study(bench, [run], single)) for run in runs)
     return replace(study, runs=tuple(alone))
+
+
+def side_by_side(bench: Bench, logs: Sequence[RunLog], options: EstimateOptions) -> Study:
+    """Two runs, each studied alone, the second compared with the first; there is no joint estimate.
+
+    Raises:
+        UsageError: there are not two logs, or one run is given twice.
+        LogError: a log lacks what an estimate needs.
+    """
+    runs = [_read(bench, log, name, options, True) for log, name in zip(logs, _names(logs), strict=True)]
+    for run in runs:
+        if run.why_not:
+            raise LogError(f"--compare: {run.name} has no estimate: {run.why_not}")
+    _check_different([run.experiment for run in runs if run.experiment is not None])
+    first, second = runs
+    before = _study(bench, [first], options)
+    after = _study(bench, [second], options, earlier(before.estimate, first.name))
+    return Study((replace(first, alone=before), replace(second, alone=after)), None, Checks(), (), options)
 
 
 def _read(bench: Bench, log: RunLog, name: str, options: EstimateOptions, for_report: bool) -> Run:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -62,7 +63,8 @@ def report(
     """One page about runs of one brake, to hand over, and a JSON file beside it.
 
     The verdict comes first, then the evidence. The page is one file for screen and paper. A log that cannot be used is
-    named and left out. A run without an experiment is reported without an estimate.
+    named and left out. A run without an experiment is reported without an estimate. With ``compare`` two runs
+    stand side by side, each estimated alone, with the differences of their parameters; the worse verdict counts.
 
     Args:
         runs: MCAP files of emb-run, of one brake; with a map, recordings of others. What cannot be used is named on
@@ -90,10 +92,12 @@ def report(
     require_place("--junit", None if asked.junit is None else Path(asked.junit), (".xml",))
     if asked.junit is not None and asked.acceptance is None:
         raise UsageError("--junit: expected it with --acceptance")
+    if asked.compare and len(listed(runs)) != 2:
+        raise UsageError(f"--compare: expected two runs, got {len(listed(runs))}")
     _require_estimates()
     with needs("a report", "bench"):
         import matplotlib  # noqa: F401
-    from emb_bench.analysis.stages import make_study
+    from emb_bench.analysis.stages import make_study, side_by_side
     from emb_bench.report import acceptance as test
     from emb_bench.report.page import html
     from emb_bench.report.report import Report, document, page_of
@@ -107,7 +111,10 @@ def report(
         own = next((log for log in logs if "bench.toml" in log.attachments), logs[-1])
         its = own.bench if asked.bench is None else load_bench(asked.bench, analysis=True)
         made_by = f"emb-excite {metadata.version('emb-excite')}"
-        study = make_study(its, logs, asked, last=before, for_report=True)
+        if asked.compare and left_out:
+            raise LogError("--compare: " + "; ".join(f"{path}: {why}" for path, why in left_out))
+        compare, joint = side_by_side, partial(make_study, last=before, for_report=True)
+        study = (compare if asked.compare else joint)(its, logs, asked)
         made = Report(study, its, left_out, made_by)
         if criteria is not None:
             made = replace(made, acceptance=test.judge(criteria, study, made.without_part))

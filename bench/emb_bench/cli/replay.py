@@ -89,7 +89,8 @@ def _report(args: argparse.Namespace) -> int:
     if made.without_part:
         return EXIT_CHECK_FAILED
     accepted = None if made.acceptance is None else made.acceptance.result
-    return _exit_code(made.study, accepted, strict=args.strict)
+    codes = {_exit_code(study, accepted, strict=args.strict) for study in made.studies}
+    return EXIT_CHECK_FAILED if EXIT_CHECK_FAILED in codes else max(codes)
 
 
 def _export(args: argparse.Namespace) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -86,17 +86,30 @@ class Report:
     @property
     def _sentence(self) -> str:
         code, stops = self.verdict.code, self.study.stops
-        if code in (Code.ABORTED, Code.STOPPED):
+        if not self.compared and code in (Code.ABORTED, Code.STOPPED):
             more = f", and {len(stops) - 1} more" if len(stops) > 1 else ""
             return f"{'NOT ACCEPTED. ' if self.acceptance else ''}{say.stopped(stops[0])}{more}"
         if self.acceptance is not None:
             return self.acceptance.verdict
+        if self.compared:
+            return say.compared(self.study)
         return say.ONLY_ALONE if code is Code.APART else say.headline(self.study)
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict, that of the acceptance criteria before that on the model."""
-        return verdict(self.study, None if self.acceptance is None else self.acceptance.result)
+        """The verdict, that of the acceptance criteria before that on the model; of runs side by side the worse one."""
+        accepted = None if self.acceptance is None else self.acceptance.result
+        return min((verdict(study, accepted) for study in self.studies), key=lambda one: list(Code).index(one.code))
+
+    @property
+    def compared(self) -> bool:
+        """Returns True if the runs stand side by side, each estimated alone."""
+        return self.study.joint is None and all(run.alone is not None for run in self.study.runs)
+
+    @property
+    def studies(self) -> list[Study]:
+        """The studies that the verdict is on: the joint one, or of runs side by side each one's."""
+        return [run.alone for run in self.study.runs if run.alone is not None] if self.compared else [self.study]
 
     @property
     def without_part(self) -> list[str]:
@@ -121,7 +134,7 @@ def page_of(report: Report) -> Page:
     shown = study.joint is not None and found.code is not Code.ABORTED
     runs = study.runs
     one = runs[0] if len(runs) == 1 else None
-    motions = [Motion.of(run, report.bench, study if shown else None) for run in runs]
+    motions = [Motion.of(run, report.bench, run.alone if report.compared else study if shown else None) for run in runs]
     reported = study.used or runs
     names = study.names
     began = sorted(filter(None, (run.log.began for run in reported)))
@@ -129,10 +142,11 @@ def page_of(report: Report) -> Page:
     when = "" if not began else f", {began[0]}" + (f" to {began[-1]}" if began[-1] != began[0] else "")
     to_do = say.remedies(study, stopped=bool(study.stops)) if shown else []
     drawn = [figures.of_run(motion) for motion in motions]
-    several = trends(study.used) if len(study.used) > 1 else []
+    several = trends(study.used) if len(study.used) > 1 and not report.compared else []
     facts, table = _tested(report)
     sections = {
-        "runs": None if one else ("Runs", _runs(runs, several)),
+        "compared": ("Side by side", _compared(report, drawn)) if report.compared else None,
+        "runs": None if one or report.compared else ("Runs", _runs(runs, several)),
         "parameters": ("Parameters", _parameters(study)) if shown else None,
         "next": ("What to do next", _next(study, found, to_do)) if to_do else None,
         "motion": (_measured(motions[0]), [_motion(motions[0], drawn[0])]) if one and drawn[0] else None,
@@ -153,7 +167,7 @@ def page_of(report: Report) -> Page:
         sections=parts,
         evidence=[
             *(_evidence(study) if shown else ()),
-            *_runs_in_full(motions, drawn),
+            *_runs_in_full(report, motions, drawn),
             Section("words", "What the words mean", _words(study if shown else None), 3, folded=True),
         ],
         footer=f"Made by {report.made_by} from {', '.join(names)}. The JSON file beside this page has the same "
@@ -171,7 +185,7 @@ def _banners(report: Report, found: Verdict, *, shown: bool) -> Iterator[Text]:
     for run in study.used or study.runs:
         if not run.log.complete:
             yield Text(f"{run.name}: the log is NOT complete: {run.log.missing}", "banner care")
-    yield from (Text(say.stopped(stop), "banner bad") for stop in study.stops[1:])
+    yield from (Text(say.stopped(stop), "banner bad") for stop in study.stops[0 if report.compared else 1 :])
     # Without an estimate the first sentence names the runs already, but not the files that were left out.
     lines = report.without_part if study.joint is not None else report.without_part[: len(report.left_out)]
     yield from (Text(line, "banner care") for line in lines)
@@ -181,7 +195,12 @@ def _summary(report: Report, found: Verdict, *, shown: bool) -> Iterator[Block |
     """The verdict on the model, and on the run if there is one."""
     study, rows = report.study, list[tuple[str, Words | Sequence[Block]]]()
     one = study.runs[0] if len(study.runs) == 1 else None
-    rows.append(("Model", list(_model(study, found)) if shown else _not_judged(study)))
+    if report.compared:
+        for own in report.studies:
+            name = own.names[0]
+            rows += [(f"Model, {name}", list(_model(own, verdict(own)))), (f"Run, {name}", _end(own.runs[0]))]
+    else:
+        rows.append(("Model", list(_model(study, found)) if shown else _not_judged(study)))
     if one is not None:
         rows.append(("Run", _end(one)))
     for stop in study.stops:
@@ -191,10 +210,15 @@ def _summary(report: Report, found: Verdict, *, shown: bool) -> Iterator[Block |
             rows.append(("Advice", f"{advice}. Find the cause before the next run."))
     yield Facts(rows)
     yield tables.acceptance_table(report.acceptance)
-    if not shown:
+    if not shown and not report.compared:
         return
     yield Text(f"sigma: {say.TERMS['sigma']}. chi2/n: {say.TERMS['chi2/n']}.", "note print")
-    if defects := [*say.missing(study), *caveats(study.estimate)]:
+    mark = "{}: {}" if report.compared else "{1}"
+    if defects := [
+        mark.format(own.names[0], line)
+        for own in report.studies
+        for line in (*say.missing(own), *caveats(own.estimate))
+    ]:
         yield Heading("Before using a number", 3)
         yield Items(defects, "warnings")
 
@@ -250,6 +274,20 @@ def _runs(runs: Sequence[Run], found: Sequence[Trend]) -> list[Block | None]:
         "which the model fits, ± total (95 %, k=2) without the errors that all runs share."
     )
     return [run_table(runs, found), Items(agreed), Figures(panels, caption) if panels else None]
+
+
+def _compared(report: Report, drawn: Sequence[Sequence[Panel]]) -> list[Block | None]:
+    """Two runs in a column each: verdict, parameters, motion."""
+    left, right = (study.names[0] for study in report.studies)
+    pairs = [panel for pair in zip(*drawn, strict=False) for panel in pair]
+    caption = f"Left (on a narrow page first) {left}, right {right}; each with the prediction of its own estimate."
+    wrong = [own for own in report.studies if not verdict(own).holds]
+    return [
+        tables.compared(report.study.runs),
+        *(Text(f"{own.names[0]}: the intervals do not include the error of a wrong model.", "bad") for own in wrong),
+        _care(say.changed_model(report.studies[1])),
+        Figures(pairs, caption),
+    ]
 
 
 def _parameters(study: Study) -> list[Block | None]:
@@ -344,13 +382,16 @@ def _evidence(study: Study) -> Iterator[Section]:
     yield Section("uncertainty", "Uncertainty", [*blocks, _care(say.once(study))], 3, folded=True)
 
 
-def _runs_in_full(motions: Sequence[Motion], drawn: Sequence[Sequence[Panel]]) -> Iterator[Section]:
+def _runs_in_full(report: Report, motions: Sequence[Motion], drawn: Sequence[Sequence[Panel]]) -> Iterator[Section]:
     """Evidence of each run: folded by itself, or inside the fold of its run."""
     if len(motions) == 1:
         yield from (Section(name, title, blocks, 3, folded=True) for name, title, blocks in _of_run(motions[0]))
         return
     for n, (motion, panels) in enumerate(zip(motions, drawn, strict=True), 1):
-        parts: list[Block | None] = [_motion(motion, panels) if panels else None]
+        own = motion.run.alone if report.compared else None
+        parts: list[Block | None] = [_motion(motion, panels) if panels and own is None else None]
+        if own is not None:
+            parts += [replace(part, name=f"run-{n}-{part.name}", level=4, folded=False) for part in _evidence(own)]
         parts += [Section(f"run-{n}-{name}", title, blocks, 4) for name, title, blocks in _of_run(motion)]
         yield Section(f"run-{n}", f"Run {n}: {motion.run.name}", parts, 3, folded=True)
 
@@ -594,7 +635,8 @@ def document(report: Report) -> dict[str, Any]:
             "why_no_estimate": study.why_not,
             "left_out": [{"log": path, "why": why} for path, why in report.left_out],
             "estimate": estimate_document(study) if estimated else None,
-            "runs": [_run_document(run, study) for run in study.runs],
+            "compared": report.studies[1].checks.drifts if report.compared else None,
+            "runs": [_run_document(run, run.alone if report.compared and run.alone else study) for run in study.runs],
         }
     )
     return found
@@ -627,6 +669,6 @@ def _run_document(run: Run, study: Study) -> dict[str, Any]:
     if alone is not None:
         found["alone"] = {"model_fits": alone.model_fits, "conclusions": alone.conclusions}
     if not run.why_not:
-        residuals = study.residuals[study.used.index(run)]
+        residuals = study.residuals[study.logs.index(run.log)]
         found["residuals"] = {"angle": residuals[:, 0], "velocity": residuals[:, 1]}
     return found

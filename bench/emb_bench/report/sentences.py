@@ -188,6 +188,16 @@ ONLY_ALONE = (
 )
 
 
+def compared(study: Study) -> str:
+    """Verdict on each of two runs side by side, and the parameters in which they differ."""
+    from emb_bench.analysis.study import verdict
+
+    studies = [run.alone for run in study.runs if run.alone is not None]
+    changes = [d for d in studies[1].checks.drifts if d.drifted]
+    differ = "; ".join(f"{d.name} {drift(d)}" for d in changes) or "No parameter differs significantly"
+    return f"{'; '.join(f'{own.names[0]}: {verdict(own).code.value}' for own in studies)}. {differ}."
+
+
 def stopped(stop: Stop) -> str:
     """That a run did not come to its planned end, and why."""
     after = f" after {stop.periods} of {stop.planned} samples" if stop.planned else ""

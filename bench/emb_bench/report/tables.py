@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
-from emb_bench.analysis.study import Result, Study, verdict
+from emb_bench.analysis.drift import Drift
+from emb_bench.analysis.study import Result, Run, Study, verdict
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.effects import shown_as
 from emb_bench.estimate.estimate import OF_THE_BENCH, Estimate
@@ -240,21 +242,41 @@ def correlation(e: Estimate) -> tuple[Table | None, list[str]]:
     return (Table("Correlation of the estimates", ["", *labels], rows), pairs) if len(labels) > 1 else (None, [])
 
 
+def compared(runs: Sequence[Run]) -> Table:
+    """Two runs that were estimated alone, in a column each: verdict, parameters, and the change of these."""
+    first, second = (run.alone for run in runs if run.alone is not None)
+    changes, found = {d.name: d for d in second.checks.drifts}, [verdict(first), verdict(second)]
+    rows: list[list[str]] = [["verdict", *(Cell(one.code.value, one.tone) for one in found), "", "", ""]]
+    for c in (c for c in first if c.label in second):
+        row: list[str] = [c.label]
+        for v, one in zip((c, second[c.label]), found, strict=True):
+            row.append(Cell(amount(v.value, v.interval, v.unit), "" if v.identified and one.holds else "care"))
+        d = changes.get(c.label)
+        if d is None or math.isinf(d.detectable):
+            rows.append([*row, NOTHING, NOTHING, Cell("not known", "care")])
+        else:
+            rows.append([*row, _change(d), signed(d.sigmas, "+.1f"), answer(d.drifted, good=False)])
+    title = "Value ± total (95 %, k=2); difference: second less first; sigma: in its deviations between runs of a brake"
+    return Table(title, ["", *(run.name for run in runs), "difference", "sigma", "differs"], rows, words=(0, 5))
+
+
+def _change(d: Drift) -> str:
+    return f"{signed(100.0 * d.relative_change)} %" if d.relative else f"{signed(d.relative_change)} {d.unit}"
+
+
 def drifts(study: Study) -> Table:
     """Values of an earlier estimate and of this one."""
-    rows = []
-    for d in study.checks.drifts:
-        change = f"{signed(100.0 * d.relative_change)} %" if d.relative else f"{signed(d.relative_change)} {d.unit}"
-        rows.append(
-            [
-                d.name,
-                around(d.last, NORMAL_95 * d.last_deviation),
-                around(d.now, NORMAL_95 * d.deviation),
-                change,
-                signed(d.sigmas, "+.1f"),
-                answer(d.drifted, good=False),
-                drift(d),
-            ]
-        )
+    rows = [
+        [
+            d.name,
+            around(d.last, NORMAL_95 * d.last_deviation),
+            around(d.now, NORMAL_95 * d.deviation),
+            _change(d),
+            signed(d.sigmas, "+.1f"),
+            answer(d.drifted, good=False),
+            drift(d),
+        ]
+        for d in study.checks.drifts
+    ]
     header = ["parameter", "last", "now", "change", "sigma", "drifted", ""]
     return Table("Values ± total (95 %, k=2), without the errors that all runs share", header, rows, words=(0, 5, 6))

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from emb_bench import api
 from emb_bench.analysis import stages
 from emb_bench.analysis.options import EstimateOptions
 from emb_bench.analysis.stages import make_study
@@ -38,7 +39,7 @@ from emb_bench.report.page import html
 from emb_bench.report.report import Report as Made
 from emb_bench.report.report import document, intervals, page_of, timing_of, with_units
 from emb_bench.report.sentences import MORE, effects
-from emb_runtime.errors import EXIT_OUTSIDE
+from emb_runtime.errors import EXIT_OUTSIDE, LogError
 from emb_runtime.log.ring_buffer import Attachment, EventRecord
 from emb_runtime.records import CycleRecord
 from emb_runtime.safety.state_machine import FAULTS, Fault
@@ -78,6 +79,50 @@ def joint(folder: Path, good: Path, simulate: Simulate) -> Report:
     broken.write_bytes(b"no log at all")
     arguments = ("--nuisance", "x1_0", "--starts", "1")
     return make(folder / "joint.html", good, broken, other, never, *arguments, code=1)
+
+
+@pytest.mark.parametrize(
+    ("options", "model", "code", "verdicts", "differs"),
+    [
+        ("plant=exact,f_v=3e-5,seed=8", "exact", 0, ("fits", "fits"), set()),
+        ("plant=exact,f_v=3.6e-5,seed=8", "exact", 0, ("fits", "fits"), {"f_v"}),
+        ("plant=stribeck,f_v=3e-5,seed=8", "exact", 1, ("fits", "DOES NOT FIT"), None),
+    ],
+)
+def test_two_runs_stand_side_by_side_each_by_itself(
+    tmp_path: Path,
+    good: Path,
+    simulate: Simulate,
+    options: str,
+    model: str,
+    code: int,
+    verdicts: tuple[str, str],
+    differs: set[str] | None,
+) -> None:
+    other = write_log(tmp_path / "other.mcap", simulate(square, options=options))
+    given = ("--compare", "--strict", "--model", model, "--starts", "1")
+    made = make(tmp_path / "page.html", good, other, *given, code=code)
+    text, document = made.reader.text, made.numbers
+    assert all(f"{log.name}: {said}" in text for log, said in zip((good, other), verdicts, strict=True))
+    assert document["estimate"] is None
+    for path, run in zip((good, other), document["runs"], strict=True):
+        alone = make(tmp_path / "alone.html", path, *given[2:]).numbers["estimate"]
+        found = [(c["value"], c["interval"]) for c in run["alone"]["conclusions"]]
+        assert found == [(c["value"], c["interval_95"]) for c in alone["parameters"].values()]
+    changes = {d["name"]: d for d in document["compared"]}
+    assert list(changes) == ["k_m", "k_1", "T_c", "f_v"]
+    values = [[c["value"] for c in run["alone"]["conclusions"]] for run in document["runs"]]
+    assert values == [[d[when] for d in changes.values()] for when in ("last", "now")]
+    if differs is not None:
+        assert {name for name, d in changes.items() if d["drifted"]} == differs
+        assert ("No parameter differs significantly" in text) == (not differs)
+
+
+def test_a_run_without_an_estimate_is_compared_with_none(tmp_path: Path, good: Path, simulate: Simulate) -> None:
+    never = write_log(tmp_path / "never.mcap", simulate(square, options="plant=exact", stop_requested=lambda: True))
+    with pytest.raises(LogError, match=r"--compare: never\.mcap has no estimate"):
+        api.report([good, never], tmp_path / "page.html", compare=True)
+    assert not (tmp_path / "page.html").exists()
 
 
 def test_the_report_says_what_a_loss_of_all_commands_would_do(folder: Path, simulate: Simulate) -> None:
