@@ -199,6 +199,8 @@ def _read(plan: Plan, console: Console) -> int:
 
 
 def _write_bench(path: Path) -> int:
+    if path.name == "bench.schema.json":
+        raise BenchFileError(f"--write-bench {path}: the schema beside it has this name: choose another name")
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(shipped_bench_text())

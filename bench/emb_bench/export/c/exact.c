@@ -42,15 +42,15 @@ static double sliding(const brake *b) {
   return copysign(b->T_c, b->x2) + b->f_v * (1.0 + copysign(b->viscous_asymmetry, b->x2)) * b->x2;
 }
 
-static void advance(brake *b, double u, double left) {
+static int advance(brake *b, double u, double left) {
   const double drive = b->k_m * u / b->J, stiffness = b->gamma * b->k_1 / b->J;
   const double coulomb = b->T_c / b->J, viscous = b->f_v / b->J;
   b->i = u;
-  while (left > 0.0) {
+  for (int n = 0; left > 0.0 && n < MOST; n++) {
     const double pull = drive - stiffness * fmax(b->x1, 0.0);
     const double direction = (b->x2 != 0.0 ? b->x2 : pull) > 0.0 ? 1.0 : -1.0;
     const double damping = viscous * (1.0 + direction * b->viscous_asymmetry);
-    if (b->x2 == 0.0 && fabs(pull) <= coulomb) return; /* sticks */
+    if (b->x2 == 0.0 && fabs(pull) <= coulomb) return 1; /* sticks */
     const double spring = b->x1 > 0.0 || (b->x1 == 0.0 && direction > 0.0) ? stiffness : 0.0;
     const motion at = {b->x1, b->x2, pull - direction * coulomb - damping * b->x2};
     double t = fmin(left, LONGEST / (damping + sqrt(stiffness)));
@@ -70,4 +70,5 @@ static void advance(brake *b, double u, double left) {
     b->x2 = stops ? 0.0 : next.x2;
     left -= t;
   }
+  return left <= 0.0;
 }

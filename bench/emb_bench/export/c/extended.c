@@ -133,15 +133,15 @@ static void arrive(brake *b, const slide *a, step_end end, double edge, int reac
   else if (reaches && a->rate > 0.0) b->w = a->direction * limit;
 }
 
-static void advance(brake *b, double u, double left) {
+static int advance(brake *b, double u, double left) {
   double longest = left;
   if (b->current_lag == 0.0) b->i = u;
-  while (left > 0.0) {
+  for (int n = 0; left > 0.0 && n < MOST; n++) {
     if (b->x2 == 0.0) {
       const double held = fmin(holds(b, u), left);
       b->i = held > 0.0 ? current_after(b, b->i, u, held) : b->i;
       left -= held;
-      if (left <= 0.0) return;
+      if (left <= 0.0) return 1;
     }
     const slide a = begin(b, u);
     const double edge = edge_ahead(b, a.x1, a.w, a.direction);
@@ -166,4 +166,5 @@ static void advance(brake *b, double u, double left) {
     arrive(b, &a, end, edge, reaches);
     left -= h;
   }
+  return left <= 0.0;
 }

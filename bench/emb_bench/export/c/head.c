@@ -11,9 +11,13 @@ typedef struct {
 
 void brake_init(brake *b);  /* parameters as identified; then brake_start */
 void brake_start(brake *b); /* to x1_0 and x2_0, without current */
-void brake_step(brake *b, double current, double dt); /* a current [A] that is held for a time [s] */
+/* A current [A] that is held for a time [s]: 0 when that has passed. Else the brake is as before the call: J is not
+   above 0, a value is not finite, or the parameters are so extreme that a step of this length has too many segments. */
+int brake_step(brake *b, double current, double dt);
 void brake_outputs(brake *b); /* outputs of the state, after a parameter has changed */
 #endif
 
 #ifndef BRAKE_DECLARATIONS_ONLY
 #include <math.h>
+
+static const int MOST = 100000; /* segments of a step */

@@ -19,9 +19,14 @@ void brake_init(brake *b) {
   brake_start(b);
 }
 
-void brake_step(brake *b, double current, double dt) {
+int brake_step(brake *b, double current, double dt) {
+  const brake before = *b;
+  if (!(b->J > 0.0 && isfinite(current) && isfinite(dt) && dt >= 0.0)) return 1;
   b->current = current;
-  advance(b, current, dt);
+  const int passed = advance(b, current, dt);
   brake_outputs(b);
+  if (passed && isfinite(b->angle + b->velocity + b->clamping_force + b->friction_torque + b->w + b->i)) return 0;
+  *b = before;
+  return 1;
 }
 #endif
