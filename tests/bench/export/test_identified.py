@@ -202,6 +202,23 @@ def test_firmware_can_hold_the_c(name: str, tmp_path: Path) -> None:
     assert_same(rows, expected(found, currents))
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("J", 0.0), ("J", -1.0), ("J", np.nan), ("T_c", np.nan), ("k_m", np.nan), ("current", np.nan)]
+    + [(name, value) for name in ("f_v", "viscous_asymmetry") for value in (1e12, -1e12)],
+)
+def test_a_step_that_cannot_be_computed_says_so_and_changes_nothing(name: str, value: float, tmp_path: Path) -> None:
+    found = Identified("test", BENCH, BENCH.brake, Mechanics())
+    main = f"b.{name} = {value!r};" if name != "current" else "u = NAN;"
+    text = f'#include "brake.c"\nint main(void) {{ brake b; double u = 3.0; brake_init(&b); brake_step(&b, u, 0.01);\n{main}'
+    text += "const brake old = b; int bad = brake_step(&b, u, 0.01);\n"
+    text += "return !(bad && b.x1 == old.x1 && b.x2 == old.x2 && b.current == old.current); }"
+    (tmp_path / "brake.c").write_text(c_source(found), encoding="utf-8")
+    (tmp_path / "main.c").write_text(text.replace("= nan;", "= NAN;"), encoding="utf-8")
+    subprocess.run(["cc", "-O2", "-o", "main", "main.c", "-lm"], cwd=tmp_path, check=True)
+    subprocess.run(["./main"], cwd=tmp_path, check=True)
+
+
 def test_an_exported_estimate_has_its_values_and_intervals(log: Path, study: Study, tmp_path: Path) -> None:
     said = api.export(log, tmp_path / "brake.fmu")
     assert said.endswith("parameters: estimate of run.mcap")

@@ -39,7 +39,6 @@ static const size_t places[] = {
 enum { CURRENT = @current@, COUNT = CURRENT + 5 };
 
 static const double least[] = {@least@}; /* min of each, and of the current */
-
 static status refuse(const instance *c, text message) {
   if (c && c->log) c->log(c->environment, ERROR, "logStatusError", message);
   return ERROR;

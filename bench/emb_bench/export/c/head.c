@@ -11,13 +11,11 @@ typedef struct {
 
 void brake_init(brake *b);  /* parameters as identified; then brake_start */
 void brake_start(brake *b); /* to x1_0 and x2_0, without current */
-/* A current [A] that is held for a time [s]: 0 when that has passed. Else the brake is as before the call: J is not
-   above 0, a value is not finite, or the parameters are so extreme that a step of this length has too many segments. */
+/* A current [A] held for a time [s]: 0 when it has passed; else (not finite, J <= 0, too extreme) nothing has changed. */
 int brake_step(brake *b, double current, double dt);
 void brake_outputs(brake *b); /* outputs of the state, after a parameter has changed */
 #endif
 
 #ifndef BRAKE_DECLARATIONS_ONLY
 #include <math.h>
-
 static const int MOST = 100000; /* segments of a step */
