@@ -118,7 +118,7 @@ def _glue(found: Identified, token: str) -> str:
     names = [one.name for one in found.parameters()]
     places = textwrap.fill(", ".join(f"PLACE({name})" for name in names) + ",", 104)
     lows = [0.0, *(one.least for one in found.parameters()), -math.inf]
-    least = textwrap.fill(", ".join(repr(low).replace("inf", "INFINITY") for low in lows), 84)
+    least = textwrap.fill(", ".join(f"{low:g}".replace("inf", "INFINITY") for low in lows), 112)
     numbers = {"@places@": textwrap.indent(places, "    "), "@current@": str(len(names) + 1), "@token@": token}
     numbers["@least@"] = least.replace("\n", "\n    ")
     text = part("fmi3.c")

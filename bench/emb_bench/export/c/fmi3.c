@@ -38,7 +38,7 @@ static const size_t places[] = {
     PLACE(current), PLACE(angle), PLACE(velocity), PLACE(clamping_force), PLACE(friction_torque)};
 enum { CURRENT = @current@, COUNT = CURRENT + 5 };
 
-static const double least[] = {@least@}; /* min of each, and of the current */
+static const double least[] = {@least@};
 static status refuse(const instance *c, text message) {
   if (c && c->log) c->log(c->environment, ERROR, "logStatusError", message);
   return ERROR;
@@ -86,8 +86,8 @@ FMI(fmi3GetFloat64)(instance *c, const reference v[], size_t n, double x[], size
 FMI(fmi3SetFloat64)(instance *c, const reference v[], size_t n, const double x[], size_t m) {
   for (size_t k = 0; k < n; k++) {
     if (v[k] < 1 || v[k] > CURRENT || n != m) return refuse(c, "neither a parameter nor the current");
-    if (!isfinite(x[k]) || x[k] < least[v[k]] || (places[v[k]] == PLACE(J) && x[k] <= 0.0))
-      return refuse(c, "expected a number that is not below its min; J above 0");
+    if (!isfinite(x[k]) || x[k] < least[v[k]]) return refuse(c, "expected a number, not below min");
+    if (places[v[k]] == PLACE(J) && x[k] <= 0.0) return refuse(c, "expected J above 0");
   }
   for (size_t k = 0; k < n; k++) memcpy((char *)c + places[v[k]], &x[k], sizeof(double));
   const double current = c->b.current;
@@ -99,8 +99,7 @@ FMI(fmi3SetFloat64)(instance *c, const reference v[], size_t n, const double x[]
 FMI(fmi3DoStep)(instance *c, double point, double size, _Bool final, _Bool *event, _Bool *ends, _Bool *early,
                 double *last) {
   if (!(size > 0.0 && isfinite(size))) return refuse(c, "expected a step longer than 0 s");
-  *event = *ends = *early = 0;
-  *last = c->time;
+  *last = c->time, *event = *ends = *early = 0;
   if (brake_step(&c->b, c->b.current, size)) return refuse(c, "no motion that can be computed: extreme parameters");
   c->time = *last = point + size;
   return OK;
