@@ -211,7 +211,7 @@ def test_firmware_can_hold_the_c(name: str, tmp_path: Path) -> None:
 def test_a_step_that_cannot_be_computed_says_so_and_changes_nothing(name: str, value: float, tmp_path: Path) -> None:
     found = Identified("test", BENCH, BENCH.brake, Mechanics())
     main = f"b.{name} = {value!r};" if name != "current" else "u = NAN;"
-    text = f'#include "brake.c"\nint main(void) {{ brake b; double u = 3.0; brake_init(&b);\n'
+    text = '#include "brake.c"\nint main(void) { brake b; double u = 3.0; brake_init(&b);\n'
     text += f"brake_step(&b, u, 0.01); {main}"
     text += "const brake old = b; int bad = brake_step(&b, u, 0.01);\n"
     text += "return !(bad && b.x1 == old.x1 && b.x2 == old.x2 && b.current == old.current); }"

@@ -26,7 +26,6 @@ int brake_step(brake *b, double current, double dt) {
   const int passed = advance(b, current, dt);
   brake_outputs(b);
   if (passed && isfinite(b->angle + b->velocity + b->clamping_force + b->friction_torque + b->w + b->i)) return 0;
-  *b = before;
-  return 1;
+  return *b = before, 1;
 }
 #endif
