@@ -43,6 +43,7 @@ def constancy(values: Sequence[float], deviations: Sequence[float]) -> Constancy
     return Constancy(len(v), mean, float(weights.sum() ** -0.5), chi2, p_value, scatter, p_value >= DIFFERENT)
 
 
+TESTS = 12  # Slopes that a campaign tests: four parameters over time, temperature and supply voltage
 BEYOND = 3.0  # Standard deviations from the median at which a control chart has its limits (Shewhart 1931)
 
 
@@ -56,17 +57,22 @@ class Slope:
 
     @property
     def significant(self) -> bool:
-        """True if the test rejects that there is none."""
-        return self.p_value < DIFFERENT
+        """True if the test rejects that there is none, as one of ``TESTS`` (Bonferroni)."""
+        return self.p_value < DIFFERENT / TESTS
 
 
 def slope(values: Sequence[float], deviations: Sequence[float], conditions: Sequence[float]) -> Slope | None:
-    """Slope of a number over a condition; None for fewer than three runs, or a condition that does not change."""
-    if len(values) < 3:
+    """Slope of a number over a condition; None for fewer than three runs, or a condition that does not change.
+
+    A run without a positive, finite deviation does not count.
+    """
+    v, s, x = (np.asarray(given, np.float64) for given in (values, deviations, conditions))
+    known = np.isfinite(s) & (s > 0.0)
+    if np.count_nonzero(known) < 3:
         return None
     from scipy import special
 
-    v, x, weights = np.asarray(values), np.asarray(conditions, np.float64), np.asarray(deviations) ** -2.0
+    v, x, weights = v[known], x[known], s[known] ** -2.0
     away = x - weights @ x / weights.sum()
     spread = float(weights @ away**2)
     if not spread > 0.0:
@@ -82,8 +88,10 @@ def slope(values: Sequence[float], deviations: Sequence[float], conditions: Sequ
 
 def beyond(values: Sequence[float], deviations: Sequence[float]) -> list[int]:
     """Runs outside of a control chart's limits: beyond the median by ``BEYOND`` standard deviations of their own."""
-    distances = np.abs(np.asarray(values) - np.median(values)) / np.asarray(deviations)
-    return [int(i) for i in np.flatnonzero(distances > BEYOND)] if len(distances) > 2 else []
+    if len(values) < 3:
+        return []
+    distances = np.abs(np.asarray(values) - np.median(values))
+    return [int(i) for i in np.flatnonzero(distances > BEYOND * np.asarray(deviations))]
 
 
 Effects = Mapping[str, tuple[float, float]]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -166,3 +168,18 @@ def test_a_slope_over_a_condition_is_that_of_weighted_least_squares() -> None:
 def test_a_run_beyond_the_control_limits_is_named_and_those_of_plain_scatter_are_not() -> None:
     assert beyond([1.0, 1.1, 0.9, 1.05, 2.0], [0.1] * 5) == [4]
     assert beyond([1.0, 1.1, 0.9, 1.05], [0.1] * 4) == []
+
+
+@pytest.mark.parametrize("deviation", [0.0, math.inf, math.nan])
+def test_a_run_without_a_deviation_has_no_part_in_a_slope(deviation: float) -> None:
+    values, deviations, at = [1.0, 2.0, 3.0, 90.0], [0.1, 0.1, 0.1, deviation], [0.0, 1.0, 2.0, 3.0]
+    assert slope(values, deviations, at) == slope(values[:3], deviations[:3], at[:3])
+    assert slope(values[1:], deviations[1:], at[1:]) is None
+    assert beyond([2.0, 2.0, 2.0], [deviation] * 3) == []
+
+
+def test_a_slope_has_to_be_significant_as_one_of_all_that_a_campaign_tests() -> None:
+    found = slope([0.0, 1.0, 2.0, 3.0], [1.0] * 4, [0.0, 1.2, 2.4, 3.6])
+    assert found is not None
+    assert replace(found, p_value=0.005).significant is False
+    assert replace(found, p_value=0.0005).significant is True
