@@ -11,9 +11,10 @@ from typing import Any
 from emb_bench.api.arguments import is_row, require_options
 from emb_bench.api.runs import Run, delete_with, open_run
 from emb_bench.config.bench import load_bench
+from emb_bench.config.conditions import CONDITIONS
 from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.experiment.experiment import planned
-from emb_bench.sim.simulated_brake import CONDITIONS, NOISES, brake_of
+from emb_bench.sim.simulated_brake import NOISES, brake_of
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError, needs
 

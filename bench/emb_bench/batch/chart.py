@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from emb_bench.analysis.several_runs import BEYOND, beyond, slope
 from emb_bench.batch.row import Row, unit_of
-from emb_bench.batch.summary import CONDITIONS, is_usable, measured
+from emb_bench.batch.summary import CHANGES_WITH, condition_of, counting, is_usable, measured
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.figures import COLOURS, DASHED, drawn
 
@@ -23,11 +23,10 @@ def draw_chart(rows: Sequence[Row], names: Sequence[str], path: Path) -> bool:
 
     As in the summary, copies of a log and runs that the model does not fit are left out.
     """
-    counted = [row for row in rows if row["error"] is None and row.get("copy_of") is None]
-    used = {name: found for name in names if (found := [row for row in counted if is_usable(row, name)])}
+    used = {name: found for name in names if (found := [row for row in counting(rows) if is_usable(row, name)])}
     if not used:
         return False
-    shown = [key for key in CONDITIONS if any(row.get(key) is not None for found in used.values() for row in found)]
+    shown = [key for key in CHANGES_WITH if any(row.get(key) is not None for found in used.values() for row in found)]
     begun = min(row["start_time"] for found in used.values() for row in found)
     title = f"Control chart; dashed: median ± {BEYOND:g} standard deviations between runs, of each run"
     size = (max(6.5, 0.8 + 3.4 * len(shown)), 0.8 + 1.7 * len(used))
@@ -35,14 +34,12 @@ def draw_chart(rows: Sequence[Row], names: Sequence[str], path: Path) -> bool:
         for name, line in zip(used, axes, strict=True):
             values, deviations = measured(used[name], name)
             for key, axis in zip(shown, line, strict=True):
-                known = [i for i, row in enumerate(used[name]) if row.get(key) is not None]
-                zero, factor = begun if key == "start_time" else 0, CONDITIONS[key][0]
-                at = np.array([factor * (used[name][i][key] - zero) for i in known], np.float64)
-                _draw(axis, name, at, values, deviations, known)
+                known, at = condition_of(used[name], key, begun)
+                _draw(axis, name, np.array(at), values, deviations, known)
         for key, axis in zip(shown, axes[-1], strict=True):
-            label = "time since the first run" if key == "start_time" else key.replace("_", " ")
+            label, unit = CHANGES_WITH[key]
             axis.locator_params(axis="x", nbins=5)
-            axis.set_xlabel(f"{label} [{CONDITIONS[key][1]}]")
+            axis.set_xlabel(f"{label}{' since the first run' if key == 'start_time' else ''} [{unit}]")
     return True
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from emb_bench.analysis.several_runs import Constancy, Slope, beyond, constancy, slope
 from emb_bench.batch.row import NONE, CampaignOptions, Row, unit_of
 from emb_bench.brake.parameters import PARAMETERS
+from emb_bench.config.conditions import CONDITIONS
 from emb_bench.documents import to_json
 from emb_bench.estimate.records import DONE
 from emb_bench.numbers import p_value, relative, signed
@@ -22,8 +23,9 @@ from emb_runtime.numbers import NOTHING, plain
 
 SHOWN = 3  # Most logs of a kind that are named without ``-v``
 OF_AN_ESTIMATE = ("estimate", "low", "high", "between_runs", "repeatability")
-CONDITIONS = {"start_time": (1.0 / 3.6e12, "h"), "temperature": (1.0, "°C"), "supply_voltage": (1.0, "V")}
-"""Columns that a parameter may change with: factor to their unit, and that unit."""
+CHANGES_WITH = {"start_time": ("time", "h")} | {name: (one.label, one.unit) for name, one in CONDITIONS.items()}
+"""Columns that a parameter may change with: what they are, and their unit."""
+HOUR = 3.6e12  # [ns]
 OVER_RUNS = f"The mean is weighted by information, total and repeatability are medians. {INTERVALS}"
 
 
@@ -74,7 +76,7 @@ class Campaign:
 def summarise(rows: Sequence[Row], options: CampaignOptions, result: str) -> Campaign:
     """Summary of a campaign; numbers may be infinite."""
     good = [row for row in rows if row["error"] is None]
-    counted = [row for row in good if row.get("copy_of") is None]
+    counted = counting(rows)
     return Campaign(
         result=result,
         logs=len(rows),
@@ -91,6 +93,11 @@ def summarise(rows: Sequence[Row], options: CampaignOptions, result: str) -> Cam
         models=tuple(sorted({row["model"] for row in good if row.get("model") is not None})),
         parameters={name: _parameter(counted, name) for name in options.names},
     )
+
+
+def counting(rows: Sequence[Row]) -> list[Row]:
+    """Logs that were evaluated, and each run once."""
+    return [row for row in rows if row["error"] is None and row.get("copy_of") is None]
 
 
 def document(c: Campaign) -> dict[str, Any]:
@@ -148,15 +155,22 @@ def measured(used: Sequence[Row], name: str) -> tuple[NDArray[np.float64], NDArr
     return found["estimate"], found["between_runs"]
 
 
+def condition_of(used: Sequence[Row], key: str, begun: int) -> tuple[list[int], list[float]]:
+    """Places of the rows that have a column of ``CHANGES_WITH``, and its values; time counts from ``begun`` [ns]."""
+    known = [i for i, row in enumerate(used) if row.get(key) is not None]
+    if key == "start_time":
+        return known, [(used[i][key] - begun) / HOUR for i in known]
+    return known, [used[i][key] for i in known]
+
+
 def _estimates(used: Sequence[Row], name: str) -> ParameterEstimates | None:
     if not used:
         return None
     found = _columns(used, name)
     values, deviations = found["estimate"], found["between_runs"].tolist()
     over = {}
-    for key, (factor, _) in CONDITIONS.items():
-        known = [i for i, row in enumerate(used) if row.get(key) is not None]
-        at = [factor * (used[i][key] - used[known[0]][key]) for i in known]
+    for key in CHANGES_WITH:
+        known, at = condition_of(used, key, used[0]["start_time"])
         if (one := slope(values[known].tolist(), [deviations[i] for i in known], at)) is not None:
             over[key] = one
     return ParameterEstimates(
@@ -217,8 +231,8 @@ def _trend(c: Campaign) -> Iterator[str]:
             if one.significant:
                 share = one.slope / abs(p.estimate.median) if p.relative else one.slope
                 size = f"{signed(100.0 * share)} %" if p.relative else f"{signed(share)} {p.unit}"
-                with_ = "time" if key == "start_time" else key.replace("_", " ")
-                yield f"{name} changes with {with_}: {size} per {CONDITIONS[key][1]} ({p_value(one.p_value)})"
+                label, unit = CHANGES_WITH[key]
+                yield f"{name} changes with {label}: {size} per {unit} ({p_value(one.p_value)})"
         if p.estimate.beyond:
             logs = ", ".join(p.estimate.beyond[:SHOWN]) + (" ..." if len(p.estimate.beyond) > SHOWN else "")
             yield f"{name}: beyond the control limits (3 deviations between runs from the median): {logs}"

@@ -23,6 +23,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from emb_bench.config.bench import Bench, parse_bench
+from emb_bench.config.conditions import CONDITIONS
 from emb_bench.documents import ByName
 from emb_bench.logs.mcap_file import (
     DAMAGE,
@@ -48,9 +49,6 @@ from emb_runtime.records import CycleRecord, Frame, RunType
 from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.system import terminal
 from emb_runtime.system.input_file import open_regular
-
-CONDITIONS = {"temperature": ("Temperature", "°C"), "supply_voltage": ("SupplyVoltage", "V")}
-"""Conditions of a run that a node may send: signal of ``EMB_Conditions``, and unit."""
 
 Table = Mapping[str, NDArray[Any]]
 """One topic: its fields as columns, ``publish_time`` and ``log_time`` [Unix ns], and ``order`` in the file."""
@@ -361,7 +359,7 @@ class RunLog:
     def measured_conditions(self) -> Mapping[str, NDArray[np.float64]]:
         """Values that :attr:`conditions` are the means of, in the order of their frames, by name."""
         found, topic = dict[str, NDArray[np.float64]](), "/emb/EMB_Conditions"
-        for name, (signal, _) in CONDITIONS.items():
+        for name, (signal, _, _) in CONDITIONS.items():
             values = np.asarray(self.tables[topic].get(signal, ()), np.float64) if topic in self.topics else np.empty(0)
             one = load_layout().conditions.signal(signal)
             known = values[(values >= one.minimum) & (values <= one.maximum)]  # this way round, NaN is none

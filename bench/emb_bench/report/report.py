@@ -13,11 +13,11 @@ from emb_bench.analysis.conclusion import Conclusion
 from emb_bench.analysis.study import Code, Run, Study, Verdict, verdict
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import QUANTILES, Bench
+from emb_bench.config.conditions import CONDITIONS
 from emb_bench.documents import to_json
 from emb_bench.estimate.records import DONE, METHODS
 from emb_bench.logs import timing
 from emb_bench.logs.info import info_document
-from emb_bench.logs.log import CONDITIONS
 from emb_bench.logs.timing import INTERVALS, Timing, quantiles
 from emb_bench.numbers import p_value, seconds, signed
 from emb_bench.report import figures, tables
@@ -315,9 +315,9 @@ def _parameters(study: Study) -> list[Block | None]:
 def _signature(study: Study) -> Facts:
     """Lines to be signed; temperature and supply as the nodes sent them, the mean of the runs."""
     logs, told = [run.log.conditions for run in study.used or study.runs], list[str]()
-    for name, (_, unit) in CONDITIONS.items():
+    for name, condition in CONDITIONS.items():
         if values := [one[name] for one in logs if name in one]:
-            told.append(f"{plain(sum(values) / len(values), 4)} {unit}")
+            told.append(f"{plain(sum(values) / len(values), 4)} {condition.unit}")
     return Facts([("Temperature, supply", ", ".join(told)), *BLANK], "signature")
 
 

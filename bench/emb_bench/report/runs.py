@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from emb_bench.config.bench import COUNTED, QUANTILE_NAMES
-from emb_bench.logs.log import CONDITIONS, RunLog, end_detail
+from emb_bench.config.conditions import CONDITIONS
+from emb_bench.logs.log import RunLog, end_detail
 from emb_bench.logs.timing import INTERVALS, BudgetCheck, Timing, document, judge, quantiles, timing
 from emb_bench.numbers import percent, seconds
 from emb_bench.report.text import Table, facts, listed, wrapped
@@ -79,7 +80,7 @@ def _largest(largest: Mapping[str, float] | None) -> str:
 
 def _between(name: str, ends: Mapping[str, float]) -> str:
     """A condition's least and largest value, with its unit."""
-    return f"{plain(ends['min'], 4)} to {plain(ends['max'], 4)} {CONDITIONS[name][1]}"
+    return f"{plain(ends['min'], 4)} to {plain(ends['max'], 4)} {CONDITIONS[name].unit}"
 
 
 def _listed(title: str, entries: Mapping[str, str]) -> list[str]:

@@ -17,6 +17,7 @@ import numpy as np
 
 from emb_bench.brake.motion import Floats, Integers, advance, no_sensitivity, rest
 from emb_bench.config.bench import with_tables
+from emb_bench.config.conditions import CONDITIONS
 from emb_bench.config.plants import DEFAULT_PLANT, Instruments, Mechanics, Plant
 from emb_bench.sim.instruments import MEMORY, command, measure, settle
 from emb_runtime.can.messages import load_layout
@@ -128,7 +129,6 @@ class SimulatedBrake:
 
 
 NOISES = ("angle_noise", "velocity_noise")  # Options for sensors that are not as the bench file says
-CONDITIONS = {"temperature": "Temperature", "supply_voltage": "SupplyVoltage"}  # Options, and signals of their frame
 LONGEST_SEED = 18  # Digits of a seed
 FARTHEST = 100.0  # A brake that is farther from nominal, by this factor, is a typing error
 
@@ -250,7 +250,7 @@ def _conditions(given: dict[str, Any], option: str) -> tuple[float, ...]:
     """Temperature [degC] and supply voltage [V], or nothing: one frame carries both."""
     told = {name: given.pop(name) for name in CONDITIONS if name in given}
     for name, text in told.items():
-        signal = load_layout().conditions.signal(CONDITIONS[name])
+        signal = load_layout().conditions.signal(CONDITIONS[name].signal)
         if not signal.minimum <= _number(text) <= signal.maximum:  # this way round, NaN is refused
             raise UsageError(f"{option}{name}: expected {signal.range_text}, got '{text}'")
     if len(told) == 1:
