@@ -30,7 +30,7 @@ from emb_bench.config.machine import Machine
 from emb_bench.recordings.map_file import RecordingMap
 from emb_bench.report import acceptance
 from emb_runtime.config import bench
-from emb_runtime.config.schemas import SCHEMAS
+from emb_runtime.config.schemas import SCHEMAS, schema_file
 from emb_runtime.drives import mapping_file
 
 ROOT = Path(__file__).parents[1]
@@ -158,7 +158,7 @@ def completed(command: str) -> argparse.ArgumentParser:
 def shipped_files() -> Iterator[tuple[Path, str]]:
     """Each file, and its text."""
     for kind in SCHEMAS:
-        path = ROOT / "runtime" / "emb_runtime" / "config" / f"{kind}.schema.json"
+        path = ROOT / "runtime" / "emb_runtime" / "config" / schema_file(kind)
         yield path, json.dumps(schema(kind), indent=1, ensure_ascii=False) + "\n"
     for command in COMMANDS:
         for shell, place in SHELLS.items():

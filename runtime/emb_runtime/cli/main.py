@@ -21,7 +21,7 @@ from emb_runtime.cli.plan import Output, Plan, Stage
 from emb_runtime.cli.preflight import Check, RefusedError, table
 from emb_runtime.cli.session import Bus, Console, listen_only
 from emb_runtime.config.bench import shipped_bench_text
-from emb_runtime.config.schemas import write_schemas
+from emb_runtime.config.schemas import schema_file, write_schemas
 from emb_runtime.errors import EXIT_DONE, BenchFileError, EmbError, UsageError
 from emb_runtime.records import LISTEN_ONLY_LOG
 from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child
@@ -199,7 +199,7 @@ def _read(plan: Plan, console: Console) -> int:
 
 
 def _write_bench(path: Path) -> int:
-    if path.name == "bench.schema.json":
+    if path.name == schema_file("bench"):
         raise BenchFileError(f"--write-bench {path}: the schema beside it has this name: choose another name")
     try:
         with path.open("x", encoding="utf-8") as file:

@@ -11,6 +11,11 @@ from pathlib import Path
 SCHEMAS = ("bench", "mapping", "map", "acceptance")  # Kinds of files
 
 
+def schema_file(kind: str) -> str:
+    """Name of the schema of a kind of files."""
+    return f"{kind}.schema.json"
+
+
 def write_schemas(folder: Path, *kinds: str) -> None:
     """Write the schemas of some kinds of files into a folder, of all if none is named; they replace older ones.
 
@@ -20,5 +25,5 @@ def write_schemas(folder: Path, *kinds: str) -> None:
         OSError: the folder is not there, or cannot be written.
     """
     for kind in kinds or SCHEMAS:
-        name = f"{kind}.schema.json"
+        name = schema_file(kind)
         (folder / name).write_bytes(resources.files("emb_runtime.config").joinpath(name).read_bytes())
