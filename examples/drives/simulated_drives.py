@@ -144,7 +144,7 @@ class ODrive(SimulatedDrive):
 
 
 class Vesc(SimulatedDrive):
-    """VESC, controller id 5, 7 pole pairs: status messages 1 and 4 each period; a current needs no arming."""
+    """VESC, controller id 5, 7 pole pairs: status 1 and 4 each period, 5 now and then; a current needs no arming."""
 
     IDENTIFIER, POLE_PAIRS = 5, 7
 
@@ -156,15 +156,13 @@ class Vesc(SimulatedDrive):
         self.asked, self.armed = struct.unpack(">i", frame.data)[0] / 1000.0, True
 
     def broadcast(self) -> list[Frame]:
-        """CAN_PACKET_STATUS and CAN_PACKET_STATUS_4."""
+        """CAN_PACKET_STATUS and CAN_PACKET_STATUS_4, now and then CAN_PACKET_STATUS_5."""
         angle, velocity = self.measured
         erpm = round(velocity * 60.0 / (2.0 * math.pi) * self.POLE_PAIRS)
         first = struct.pack(">ihh", erpm, max(min(round(self.applied * 10.0), 32767), -32768), 0)
         fourth = struct.pack(">hhhh", 250, 250, 0, round(math.degrees(angle) % 360.0 * 50.0))
-        return [
-            Frame(9 << 8 | self.IDENTIFIER, first, extended=True),
-            Frame(16 << 8 | self.IDENTIFIER, fourth, extended=True),
-        ]
+        packets = {9: first, 16: fourth} | ({} if self.periods % 50 else {27: struct.pack(">ihh", 0, 240, 0)})
+        return [Frame(number << 8 | self.IDENTIFIER, data, extended=True) for number, data in packets.items()]
 
 
 class Mit(SimulatedDrive):

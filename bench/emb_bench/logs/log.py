@@ -42,7 +42,7 @@ from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.drives.mapping import PROPERTIES, MappingError
 from emb_runtime.drives.mapping import Mapping as DriveMapping
 from emb_runtime.drives.mapping_file import parse_mapping
-from emb_runtime.drives.signals import physical_value, raw_value
+from emb_runtime.drives.wire import conditions_in
 from emb_runtime.errors import BenchFileError, LogError, UsageError, near
 from emb_runtime.log import topics
 from emb_runtime.records import CycleRecord, Frame, RunType
@@ -370,19 +370,11 @@ class RunLog:
 
     def _told_by(self, drive: DriveMapping) -> dict[str, NDArray[np.float64]]:
         """Conditions by the frames on the bus of a mapped drive, by name, without what cannot be believed."""
-        found: dict[str, list[float]] = {name: [] for name in drive.conditions}
-        heard = [(name, one, drive.messages[one.message]) for name, one in drive.conditions.items()]
-        columns = ("id", "data", "is_extended", "is_rtr", "is_error")
-        for identifier, data, extended, remote, error in self.rows("/drive/rx", *columns):
-            for name, one, info in heard:
-                if (identifier, extended, remote, error) != (info.identifier, info.extended, False, False):
-                    continue
-                is_whole = len(data) == info.length and not info.protection.fault(data)
-                if is_whole and (info.page is None or raw_value(info.page, data) == info.page_value):
-                    value = physical_value(one.field, data)
-                    if one.low <= value <= one.high:  # this way round, NaN is none
-                        found[name].append(one.si(value))
-        return {name: np.array(values) for name, values in found.items() if values}
+        found: dict[str, list[float]] = {}
+        for identifier, data, *kind in self.rows("/drive/rx", "id", "data", "is_extended", "is_rtr", "is_error"):
+            for name, value in conditions_in(drive, Frame(identifier, data, 0, *kind)).items():
+                found.setdefault(name, []).append(value)
+        return {name: np.array(values) for name, values in found.items()}
 
     @cached_property
     def wall_offset_ns(self) -> int:

@@ -33,6 +33,9 @@ class Answers:
         self.samples = self.obeyed = self.braked = self.refused = 0
         """Numbers of samples, of commands that were obeyed, of samples without one in time while the host commands, and
         of commands that were not obeyed."""
+        self.conditions = dict[str, float]()
+        """Temperature [degC] and supply voltage [V] by name, the newest since they were last sent."""
+        self._conditions_counter = COUNTER_MODULUS - 1  # the first ones have counter 0
 
     @property
     def deadline_ns(self) -> int | None:
@@ -80,7 +83,7 @@ class Answers:
     def frames(
         self, sample: DriveSample, applied: float, device_ns: int, state: NodeState, reason: StopReason
     ) -> list[Frame]:
-        """Angle, velocity, and now and then status, of a new sample, which may be answered from now on.
+        """Angle, velocity, and now and then status and conditions, of a new sample, which may be answered from now on.
 
         With the current in the period that ended [A], the time since the first sample [ns], the node's state, and the
         reason of its latest stop.
@@ -100,4 +103,16 @@ class Answers:
         if nth == 0:
             number = status % COUNTER_MODULUS
             frames.append(layout.encode_status(number, state, reason, self.refused, self._identity))
+            frames += self._conditions_frames()
         return [frame._replace(time_ns=sample.time_ns) for frame in frames]
+
+    def _conditions_frames(self) -> list[Frame]:
+        """The frame of the conditions, once both have come, and if their signals carry them."""
+        message = self._layout.conditions
+        signals = message.signal("Temperature"), message.signal("SupplyVoltage")
+        temperature, voltage = (self.conditions.get(name, math.nan) for name in ("temperature", "supply_voltage"))
+        if not all(s.minimum <= v <= s.maximum for s, v in zip(signals, (temperature, voltage), strict=True)):
+            return []  # this way round, NaN is none
+        self.conditions.clear()
+        self._conditions_counter = (self._conditions_counter + 1) % COUNTER_MODULUS
+        return [self._layout.encode_conditions(self._conditions_counter, temperature, voltage)]

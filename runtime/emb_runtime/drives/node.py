@@ -21,7 +21,7 @@ from emb_runtime.drives.answers import Answers
 from emb_runtime.drives.mapping import Mapping
 from emb_runtime.drives.phases import Active, Arming, Failed, Off, Phase, Ready, Stopping
 from emb_runtime.drives.samples import SampleTimes, SensorCheck
-from emb_runtime.drives.wire import DriveState, Outlet, Receiver
+from emb_runtime.drives.wire import DriveState, Outlet, Receiver, conditions_in
 from emb_runtime.errors import FrameError, SafetyStopError
 from emb_runtime.records import Frame
 from emb_runtime.safety.shield import damped_current
@@ -146,8 +146,12 @@ class DriveNode:
         self.answers.obey(command)
 
     def handle_drive(self, frame: Frame, now_ns: int) -> list[Frame]:
-        """Take a frame of the drive; gives our angle and velocity, now and then status, if it completes a sample."""
+        """Take a frame of the drive; gives our angle and velocity if it completes a sample, now and then status, too.
+
+        Behind a status come the conditions, where the mapping names both and they have come since the last ones.
+        """
         receiver, before_ns = self.receiver, self.receiver.state_ns
+        self.answers.conditions |= conditions_in(self._mapping, frame)
         sample = receiver.take(frame)
         if isinstance(self.phase, Arming) and receiver.state_ns != before_ns:
             self.arming.on_report(receiver.state(now_ns), receiver.state_ns)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from emb_runtime.can.e2e import LeakyCount
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.drives.mapping import ConstantFrame, Mapping, MessageInfo
-from emb_runtime.drives.signals import raw_value
+from emb_runtime.drives.signals import physical_value, raw_value
 from emb_runtime.drives.wire_guard import WireGuard, WireGuardError
 from emb_runtime.errors import FrameError
 from emb_runtime.records import Frame
@@ -250,6 +250,21 @@ class Receiver:
             self._turns -= measured.wrap * round((value + self._turns - last) / measured.wrap)
             value = self._wrapped = value + self._turns
         return measured.si(value)
+
+
+def conditions_in(mapping: Mapping, frame: Frame) -> dict[str, float]:
+    """Temperature [degC] and supply voltage [V] in a frame of the drive, by name, as far as they can be believed."""
+    found = {}
+    for name, one in mapping.conditions.items():
+        info = mapping.messages[one.message]
+        if (frame.identifier, frame.extended, frame.own, frame.error) != (info.identifier, info.extended, False, False):
+            continue
+        is_whole = not frame.remote and len(frame.data) == info.length and not info.protection.fault(frame.data)
+        if is_whole and _is_of(info, frame):
+            value = physical_value(one.field, frame.data)
+            if one.low <= value <= one.high:  # this way round, NaN is none
+                found[name] = one.si(value)
+    return found
 
 
 def _is_of(info: MessageInfo, frame: Frame) -> bool:

@@ -88,15 +88,16 @@ def test_a_simulated_node_sends_them_on_request_and_no_other_frame_changes(
 
 def test_a_mapped_drive_s_own_signals_are_read_from_its_bus_where_they_can_be_believed(tmp_path: Path) -> None:
     toml, dbc = ((EXAMPLES / f"vesc.{kind}").read_text() for kind in ("toml", "dbc"))
-    line = next(row for row in toml.splitlines() if row.startswith("temperature"))
-    voltage = line.replace("temperature", "supply_voltage").replace('"degC"', '"mV"').replace("Temp_Motor", "Temp_FET")
+    line, old = (next(row for row in toml.splitlines() if row.startswith(name)) for name in ("temperature", "supply"))
+    voltage = 'supply_voltage = {signal = "VESC_Status_4.Temp_FET", unit = "mV", range = [-40, 200], offset = 1.0}'
+    toml = toml.replace(f"{old}\n", "")
     status_4 = Frame(0x1005, b"", extended=True)
     told = [(120, 412), (130, 432), (140, 2001), (-401, -401)]  # tenths; the last two are beyond the range, or half so
     frames = [status_4._replace(data=struct.pack(">hhhh", *pair, 0, 0)) for pair in told]
     frames += [frames[0]._replace(data=frames[0].data[:7]), frames[0]._replace(extended=False, identifier=5)]
     for given, expected in (
         (toml, {"temperature": 42.2}),
-        (toml.replace(line, f"{line}\n{voltage}"), {"temperature": 42.2, "supply_voltage": 0.013}),
+        (toml.replace(line, f"{line}\n{voltage}"), {"temperature": 42.2, "supply_voltage": 1.013}),
         (toml.replace(line, ""), {}),
     ):
         header = LogHeader(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import struct
 from collections import deque
 from collections.abc import Callable
@@ -20,7 +21,7 @@ from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.cli import gateway as cli
 from emb_runtime.config.bench import parse_bench
 from emb_runtime.drives.gateway import LISTEN, MOST_FRAMES, Gateway
-from emb_runtime.drives.mapping_file import load_mapping
+from emb_runtime.drives.mapping_file import load_mapping, parse_mapping
 from emb_runtime.drives.node import INTRUDED, READY_SAMPLES, DriveNode
 from emb_runtime.drives.phases import ARMED_PERIODS, LONGEST_STOP_PERIODS, Active, Failed, Off, Ready, Stopping
 from emb_runtime.errors import BusError, SafetyStopError
@@ -66,13 +67,33 @@ class Bus:
         pass
 
 
+CONDITIONS = (
+    """
+temperature = {signal = "Temperature.Motor", unit = "degC", range = [-50, 400]}
+supply_voltage = {signal = "Supply.Voltage", unit = "mV", range = [0, 100000]}
+[can.protection]""",
+    """
+BO_ 21 Temperature: 8 Axis0
+ SG_ Motor : 32|32@1- (1,0) [0|0] "degC" Host
+BO_ 23 Supply: 8 Axis0
+ SG_ Voltage : 0|32@1- (1,0) [0|0] "mV" Host
+SIG_VALTYPE_ 21 Motor : 1;
+SIG_VALTYPE_ 23 Voltage : 1;
+""",
+)
+"""Conditions of an ODrive in its mapping file, and in its DBC."""
+
+
 class Played:
     """A gateway of an ODrive that obeys its arming and disarming, and the host."""
 
-    def __init__(self, largest: float = 6.0) -> None:
+    def __init__(self, largest: float = 6.0, conditions: bool = False) -> None:
         self.clock = SteppedClock(1_000 * MS)
         self.drive, self.host = Bus(), Bus()
-        mapping, bench = load_mapping(EXAMPLES / "odrive.toml"), parse_bench(late_bench(), "bench.toml")
+        bench = parse_bench(late_bench(), "bench.toml")
+        toml, dbc = ((EXAMPLES / f"odrive.{kind}").read_text() for kind in ("toml", "dbc"))
+        signals, messages = CONDITIONS if conditions else ("[can.protection]", "")
+        mapping = parse_mapping(toml.replace("[can.protection]", signals), dbc + messages, "odrive.toml")
         bound = largest * 0.0217 + 1e-4
         mapping = replace(mapping, command=replace(mapping.command, low=-bound, high=bound))
         self.waits: list[int] = []
@@ -361,6 +382,30 @@ def test_the_counts_go_to_the_host_with_each_status(played: Played) -> None:
     assert [values["Counter"] for values in told] == [(n + 1) % 15 for n in range(len(told))]
     counts = {"NotSent": 3, "Braked": 65535, "NotBelieved": 0, "Refused": 2}
     assert told[0].items() >= {"Version": 1, **counts}.items()
+
+
+@pytest.mark.parametrize(
+    ("temperatures", "voltages", "told"),
+    [
+        ([61.5, 62.5], [12.0, 12.5, 13.0], [(62.5, 13.0)]),  # the newest of each
+        ([61.5], [], []),
+        ([], [12.5], []),
+        ([math.nan], [12.5], []),
+        ([61.5, math.nan, 1e9], [12.5, -1.0], [(61.5, 12.5)]),  # what the mapping does not believe is passed over
+        ([310.0], [12.5], []),  # believed, but no value of emb.dbc
+    ],
+)
+def test_conditions_go_to_the_host_with_a_status_once_both_have_come(
+    temperatures: list[float], voltages: list[float], told: list[tuple[float, float]]
+) -> None:
+    played = Played(conditions=True)
+    sent = [f for _ in range(250) for f in played.period()]
+    played.drive.waiting += [Frame(0x015, struct.pack("<ff", 0.0, value)) for value in temperatures]
+    played.drive.waiting += [Frame(0x017, struct.pack("<ff", value * 1e3, 0.0)) for value in voltages]
+    sent += [f for _ in range(200) for f in played.period()]
+    shown = [LAYOUT.conditions.decode(f) for f in sent if f.identifier == LAYOUT.conditions.identifier]
+    assert [(row["Temperature"], row["SupplyVoltage"]) for row in shown] == told  # in whole steps
+    assert [row["Counter"] for row in shown] == [*range(len(told))]
 
 
 def test_listening_sends_nothing(played: Played) -> None:

@@ -50,6 +50,8 @@ def test_a_run_on_a_mapped_drive_is_a_run_and_its_information_that_of_our_node(
     assert (node.answers.obeyed, node.outlet.guard.rejected, node.times.too_late) == (500, 0, "")
     assert (node.phase, node.failure) == (Off(), "")  # at rest, and let go
     within_limits(bus)
+    told = {"temperature": 25.0, "supply_voltage": 24.0} if name == "vesc" else {}  # EMB_Conditions of its gateway
+    assert open_run(tmp_path / "run.mcap").conditions == pytest.approx(told)
     monkeypatch.undo()
     iface = "sim:plant=late-command" if name == "mit" else "sim"
     same = ["--policy", str(tmp_path / "actor.onnx"), "--bench", str(tmp_path / "late.toml")]
