@@ -115,16 +115,10 @@ def _build_description() -> Element:
 
 def _glue(found: Identified, token: str) -> str:
     """The functions of FMI around the C of the brake."""
-    names = [one.name for one in found.parameters()]
-    places = textwrap.fill(", ".join(f"PLACE({name})" for name in names) + ",", 104)
     lows = [0.0, *(one.least for one in found.parameters()), -math.inf]
-    least = textwrap.fill(", ".join(f"{low:g}".replace("inf", "INFINITY") for low in lows), 112)
-    numbers = {"@places@": textwrap.indent(places, "    "), "@current@": str(len(names) + 1), "@token@": token}
-    numbers["@least@"] = least.replace("\n", "\n    ")
-    text = part("fmi3.c")
-    for mark, value in numbers.items():
-        text = text.replace(mark, value)
-    return text
+    least = textwrap.fill(", ".join(f"{low:g}" for low in lows), 104, subsequent_indent="    ")
+    numbers = {"current": str(len(lows) - 1), "token": token, "least": least.replace("inf", "HUGE_VAL")}
+    return re.sub(r"@(\w+)@", lambda mark: numbers[mark[1]], part("fmi3.c"))
 
 
 def _text(root: Element) -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import re
 import shutil
 import subprocess
@@ -20,11 +21,12 @@ from fmpy.validation import validate_fmu
 
 from emb_bench import api
 from emb_bench.analysis.study import Study
+from emb_bench.brake.exact import LONGEST
 from emb_bench.brake.forces import clamping_force, decay, sliding_torque, static_torque, travel
 from emb_bench.brake.motion import Floats
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import Mechanics
-from emb_bench.estimate.records import Unknown
+from emb_bench.estimate.records import Unknown, searched
 from emb_bench.experiment.simulate import Theta
 from emb_bench.export.c_source import OUTPUTS, c_source
 from emb_bench.export.fmu import write_fmu
@@ -138,7 +140,9 @@ def test_an_fmu_has_all_functions_of_fmi_3_in_at_most_400_lines(tmp_path: Path) 
         assert sum(len(path.read_text(encoding="utf-8").splitlines()) for path in sources) <= 400
 
 
-def test_an_importer_can_step_back_reset_and_is_refused_what_is_no_step(tmp_path: Path) -> None:
+def test_an_importer_can_step_back_reset_and_is_refused_what_is_no_step(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_fmu(Identified("test", BENCH, BENCH.brake, Mechanics()), tmp_path / "brake.fmu")
     model = fmpy.read_model_description(tmp_path / "brake.fmu")
     unpacked = fmpy.extract(str(tmp_path / "brake.fmu"), str(tmp_path / "unpacked"))
@@ -166,59 +170,117 @@ def test_an_importer_can_step_back_reset_and_is_refused_what_is_no_step(tmp_path
     fmu.reset()
     begun()
     assert stepped() == first
-    refusals: tuple[Callable[[], object], ...] = (
-        lambda: fmu.doStep(currentCommunicationPoint=0.0, communicationStepSize=0.0),
-        lambda: fmu.setFloat64([keys["current"]], [float("nan")]),
-        lambda: fmu.setFloat64([keys["angle"]], [1.0]),
-        lambda: fmu.setFloat64([keys["J"]], [0.0]),
-        lambda: fmu.setFloat64([keys["T_c"]], [-1.0]),
-        lambda: fmu.getFloat64([99]),
+    fmu.setFloat64([keys["current"]], [-3.0])  # it opens, and does not come to rest
+    refusals: tuple[tuple[Callable[[], object], str], ...] = (
+        (lambda: fmu.doStep(currentCommunicationPoint=0.0, communicationStepSize=0.0), "a step longer than 0 s"),
+        (lambda: fmu.doStep(currentCommunicationPoint=0.0, communicationStepSize=1e9), "more than 100000 segments"),
+        (lambda: fmu.setFloat64([keys["current"]], [float("nan")]), "expected a number"),
+        (lambda: fmu.setFloat64([keys["angle"]], [1.0]), "neither a parameter nor the current"),
+        (lambda: fmu.setFloat64([keys["J"]], [0.0]), "J above 0"),
+        (lambda: fmu.setFloat64([keys["T_c"]], [-1.0]), "not below min"),
+        (lambda: fmu.setFloat64([keys["contact"]], [1.0]), "set before the start"),
+        (lambda: fmu.setFloat64([keys["x2_0"]], [1.0]), "set before the start"),
+        (lambda: fmu.getFloat64([99]), "no such variable"),
+        (fmu.enterEventMode, "fmi3EnterEventMode: this FMU does not have it"),
     )
-    for refused in refusals:
+    outputs = fmu.getFloat64([keys[name] for name in OUTPUTS])
+    for refused, reason in refusals:
+        capsys.readouterr()
         with pytest.raises(FMICallException):
             refused()
+        assert reason in capsys.readouterr().out
+        assert fmu.getFloat64([keys[name] for name in OUTPUTS]) == outputs
+    fmu.reset()
+    with pytest.raises(FMICallException):
+        stepped()  # it has not been initialised
     fmu.terminate()
     fmu.freeInstance()
+
+
+def compiled(found: Identified, folder: Path) -> tuple[ctypes.CDLL, Any]:
+    """The library of a brake's C, and a brake that has started."""
+    (folder / "brake.c").write_text(c_source(found), encoding="utf-8")
+    command = ["cc", "-std=c99", "-O2", "-shared", "-fPIC", "-o", "brake.so", "brake.c", "-lm"]
+    subprocess.run(command, cwd=folder, check=True)
+    names = [*(one.name for one in found.parameters()), "current", *OUTPUTS, "x1", "x2", "w", "i"]
+
+    class Brake(ctypes.Structure):
+        _fields_ = [(name, ctypes.c_double) for name in names]
+
+    library, brake = ctypes.CDLL(str(folder / "brake.so")), Brake()
+    library.brake_step.argtypes = [ctypes.POINTER(Brake), ctypes.c_double, ctypes.c_double]
+    library.brake_init(ctypes.byref(brake))
+    return library, brake
 
 
 @pytest.mark.parametrize("name", FEATURES)
 def test_firmware_can_hold_the_c(name: str, tmp_path: Path) -> None:
     found, currents = Identified("test", BENCH, BENCH.brake, FEATURES[name]), profile(3)
-    (tmp_path / "brake.c").write_text(c_source(found), encoding="utf-8")
-    flags = ["-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror", "-O2", "-shared", "-fPIC"]
-    subprocess.run(["cc", *flags, "-o", "brake.so", "brake.c", "-lm"], cwd=tmp_path, check=True)
-    names = [one.name for one in found.parameters()]
-
-    class Brake(ctypes.Structure):
-        _fields_ = [(n, ctypes.c_double) for n in (*names, "current", *OUTPUTS, "x1", "x2", "w", "i")]
-
-    library, brake = ctypes.CDLL(str(tmp_path / "brake.so")), Brake()
-    library.brake_step.argtypes = [ctypes.POINTER(Brake), ctypes.c_double, ctypes.c_double]
-    library.brake_init(ctypes.byref(brake))
-    assert {n: getattr(brake, n) for n in names} == {one.name: one.value for one in found.parameters()}
+    library, brake = compiled(found, tmp_path)
+    assert [getattr(brake, one.name) for one in found.parameters()] == [one.value for one in found.parameters()]
     rows = np.zeros(len(currents), [(n, float) for n in OUTPUTS])
     for k, current in enumerate(currents):
-        library.brake_step(ctypes.byref(brake), current, T_S)
+        assert library.brake_step(ctypes.byref(brake), current, T_S) == 0
         rows[k] = tuple(getattr(brake, n) for n in OUTPUTS)
     assert_same(rows, expected(found, currents))
 
 
+STRICT = ["-O2", "-Wall", "-Wextra", "-Werror", "-pedantic"]
+COMPILERS = [
+    ("cc", ["-std=c99", "-Wconversion", "-Wshadow", "-Wdouble-promotion"], "brake.c"),
+    ("cc", ["-std=c99"], "fmi3.c"),
+    ("c++", ["-std=c++11", "-x", "c++"], "brake.c"),
+    ("clang", ["-std=c99", "-Wconversion", "-Wshadow", "-Wdouble-promotion"], "brake.c"),
+    ("clang", ["-std=c99"], "fmi3.c"),
+]
+
+
+@pytest.mark.parametrize("name", FEATURES)
+def test_compilers_take_the_c_without_a_warning_and_c_links_with_cpp(name: str, tmp_path: Path) -> None:
+    write_fmu(Identified("test", BENCH, BENCH.brake, FEATURES[name]), tmp_path / "brake.fmu")
+    folder = Path(fmpy.extract(str(tmp_path / "brake.fmu"), str(tmp_path / "unpacked"))) / "sources"
+    for compiler, flags, source in COMPILERS:
+        if compiler != "clang" or shutil.which(compiler):
+            subprocess.run([compiler, *STRICT, *flags, "-c", source, "-o", "x.o"], cwd=folder, check=True)
+    main = '#define BRAKE_DECLARATIONS_ONLY\n#include "brake.c"\n'
+    main += "int main() { brake b; brake_init(&b); return brake_step(&b, 1.0, 1e-3); }\n"
+    (folder / "main.cpp").write_text(main, encoding="utf-8")
+    subprocess.run(["cc", "-std=c99", "-c", "brake.c"], cwd=folder, check=True)
+    subprocess.run(["c++", *STRICT, "-o", "main", "main.cpp", "brake.o", "-lm"], cwd=folder, check=True)
+    subprocess.run(["./main"], cwd=folder, check=True)
+
+
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [("J", 0.0), ("J", -1.0), ("J", np.nan), ("T_c", np.nan), ("k_m", np.nan), ("current", np.nan)]
-    + [(name, value) for name in ("f_v", "viscous_asymmetry") for value in (1e12, -1e12)],
+    ("name", "value", "code"),
+    [("J", 0.0, 1), ("J", -1.0, 1), *((name, math.nan, 1) for name in ("J", "k_m", "T_c", "f_v", "current", "dt"))]
+    + [("current", math.inf, 1), ("dt", -1.0, 1)]
+    + [(name, value, 2) for name in ("f_v", "viscous_asymmetry") for value in (1e12, -1e12)],
 )
-def test_a_step_that_cannot_be_computed_says_so_and_changes_nothing(name: str, value: float, tmp_path: Path) -> None:
-    found = Identified("test", BENCH, BENCH.brake, Mechanics())
-    main = f"b.{name} = {value!r};" if name != "current" else "u = NAN;"
-    text = '#include "brake.c"\nint main(void) { brake b; double u = 3.0; brake_init(&b);\n'
-    text += f"brake_step(&b, u, 0.01); {main}"
-    text += "const brake old = b; int bad = brake_step(&b, u, 0.01);\n"
-    text += "return !(bad && b.x1 == old.x1 && b.x2 == old.x2 && b.current == old.current); }"
-    (tmp_path / "brake.c").write_text(c_source(found), encoding="utf-8")
-    (tmp_path / "main.c").write_text(text.replace("= nan;", "= NAN;"), encoding="utf-8")
-    subprocess.run(["cc", "-O2", "-o", "main", "main.c", "-lm"], cwd=tmp_path, check=True)
-    subprocess.run(["./main"], cwd=tmp_path, check=True)
+def test_a_step_that_cannot_be_computed_says_so_and_changes_nothing(
+    name: str, value: float, code: int, tmp_path: Path
+) -> None:
+    library, brake = compiled(Identified("test", BENCH, BENCH.brake, Mechanics()), tmp_path)
+    step = {"current": 3.0, "dt": 0.01}
+    assert library.brake_step(ctypes.byref(brake), *step.values()) == 0
+    if name in step:
+        step[name] = value
+    else:
+        setattr(brake, name, value)
+    before = bytes(brake)
+    assert library.brake_step(ctypes.byref(brake), *step.values()) == code
+    assert bytes(brake) == before
+
+
+def test_a_step_has_as_many_segments_as_a_second_of_any_brake_that_is_searched_needs(tmp_path: Path) -> None:
+    library, brake = compiled(Identified("test", BENCH, BENCH.brake, Mechanics()), tmp_path)
+    for name, end in (("J", 0), ("k_1", 1), ("f_v", 1), ("viscous_asymmetry", 0)):
+        setattr(brake, name, searched(BENCH, Unknown(name))[end])
+    rate = brake.f_v / brake.J * (1.0 - brake.viscous_asymmetry) + math.sqrt(brake.gamma * brake.k_1 / brake.J)
+    longest = 100_000 * LONGEST / rate  # time of as many segments [s]; those of features take less, see the C
+    assert longest > 5.0
+    for seconds, code in ((0.99 * longest, 0), (1.01 * longest, 2)):
+        library.brake_start(ctypes.byref(brake))
+        assert library.brake_step(ctypes.byref(brake), -4.0, seconds) == code  # it opens, and never comes to rest
 
 
 def test_an_exported_estimate_has_its_values_and_intervals(log: Path, study: Study, tmp_path: Path) -> None:

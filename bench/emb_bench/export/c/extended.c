@@ -39,11 +39,11 @@ static double edge_ahead(const brake *b, double x1, double w, double direction) 
   const double rate = stop_rate(b, w, direction);
   if (b->play > 0.0) {
     if (rate > 0.0) return x1 + (direction * stop_limit(b) - w);
-    return (w - x1) * direction > 0.0 ? w : direction * INFINITY;
+    return (w - x1) * direction > 0.0 ? w : direction * HUGE_VAL;
   }
-  if (x1 < 0.0) return direction > 0.0 ? 0.0 : -INFINITY;
-  if (direction > 0.0) return rate > 0.0 ? x1 + (1.0 - w) / rate : INFINITY;
-  if (x1 == 0.0) return -INFINITY;
+  if (x1 < 0.0) return direction > 0.0 ? 0.0 : -HUGE_VAL;
+  if (direction > 0.0) return rate > 0.0 ? x1 + (1.0 - w) / rate : HUGE_VAL;
+  if (x1 == 0.0) return -HUGE_VAL;
   return rate > 0.0 ? fmax(0.0, x1 - (1.0 + w) / rate) : 0.0;
 }
 
@@ -78,7 +78,8 @@ static step_end runge_kutta(const brake *b, const slide *a, double a1, double h)
     d[n] = acceleration(b, a, C[n] * h, x, v[n]);
   }
   for (int n = 0; n < 7; n++) error += E[n] * d[n];
-  return (step_end){x, v[6], d[6], fabs(h * error)};
+  const step_end end = {x, v[6], d[6], fabs(h * error)};
+  return end;
 }
 
 static double value_of(step_end m, quantity which) { return which == ANGLE ? m.x1 : which == VELOCITY ? m.x2 : m.a; }
@@ -110,9 +111,9 @@ static double root(const brake *b, const slide *a, double before, double h, quan
 static double holds(const brake *b, double u) {
   const double load = b->gamma * force(b), most = largest_holding(b), final = b->k_m * u - load;
   if (fabs(b->k_m * b->i - load) > most) return 0.0;
-  if (fabs(final) <= most) return INFINITY;
+  if (fabs(final) <= most) return HUGE_VAL;
   const double gap = (load + copysign(most, final)) / b->k_m - u;
-  return gap * (b->i - u) <= 0.0 ? INFINITY : fmax(0.0, b->current_lag * log((b->i - u) / gap));
+  return gap * (b->i - u) <= 0.0 ? HUGE_VAL : fmax(0.0, b->current_lag * log((b->i - u) / gap));
 }
 
 static slide begin(const brake *b, double u) {
@@ -120,8 +121,9 @@ static slide begin(const brake *b, double u) {
   const double direction = ahead > 0.0 ? 1.0 : -1.0, clamp = travel(b, b->x1, b->w);
   const double rate = stop_rate(b, b->w, direction);
   const int touches = clamp == 0.0 && direction > 0.0 && (b->play == 0.0 || rate == 0.0);
-  const int loaded = clamp > 0.0 || touches;
-  return (slide){direction, b->x1, b->x2, b->w, b->play > 0.0 || loaded ? rate : 0.0, loaded, b->i, u};
+  const double loaded = clamp > 0.0 || touches ? 1.0 : 0.0;
+  const slide a = {direction, b->x1, b->x2, b->w, b->play > 0.0 || loaded > 0.0 ? rate : 0.0, loaded, b->i, u};
+  return a;
 }
 
 static void arrive(brake *b, const slide *a, step_end end, double edge, int reaches) {

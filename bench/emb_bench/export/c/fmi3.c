@@ -16,6 +16,7 @@
 #define EXPORT __declspec(dllexport)
 #else
 #define EXPORT
+#pragma GCC diagnostic ignored "-Wunused-parameter" /* FMI names them all */
 #endif
 #define FMI(name) EXPORT status NAME(name)
 
@@ -23,20 +24,16 @@ typedef enum { OK, WARNING, DISCARD, ERROR, FATAL } status;
 typedef const char *text;
 typedef void (*logger)(void *environment, status found, text category, text message);
 typedef struct {
+  double time; /* it and what follows are the variables, in the order of their references */
   brake b;
-  double time;
   int running;
   void *environment;
   logger log;
 } instance;
 typedef uint32_t reference;
 
-#define PLACE(name) offsetof(instance, b.name)
-static const size_t places[] = {
-    offsetof(instance, time),
-@places@
-    PLACE(current), PLACE(angle), PLACE(velocity), PLACE(clamping_force), PLACE(friction_torque)};
-enum { CURRENT = @current@, COUNT = CURRENT + 5 };
+enum { J = 1, CURRENT = @current@, FIXED = CURRENT - 3, COUNT = CURRENT + 5 }; /* references; of FIXED on contact, start */
+typedef char in_order[offsetof(instance, b.friction_torque) == (COUNT - 1) * sizeof(double) ? 1 : -1];
 
 static const double least[] = {@least@};
 static status refuse(const instance *c, text message) {
@@ -79,7 +76,7 @@ FMI(fmi3Reset)(instance *c) { return c->running = 0, brake_init(&c->b), OK; }
 FMI(fmi3GetFloat64)(instance *c, const reference v[], size_t n, double x[], size_t m) {
   for (size_t k = 0; k < n; k++) {
     if (v[k] >= COUNT || n != m) return refuse(c, "no such variable");
-    memcpy(&x[k], (const char *)c + places[v[k]], sizeof(double));
+    x[k] = ((const double *)c)[v[k]];
   }
   return OK;
 }
@@ -87,9 +84,10 @@ FMI(fmi3SetFloat64)(instance *c, const reference v[], size_t n, const double x[]
   for (size_t k = 0; k < n; k++) {
     if (v[k] < 1 || v[k] > CURRENT || n != m) return refuse(c, "neither a parameter nor the current");
     if (!isfinite(x[k]) || x[k] < least[v[k]]) return refuse(c, "expected a number, not below min");
-    if (places[v[k]] == PLACE(J) && x[k] <= 0.0) return refuse(c, "expected J above 0");
+    if (v[k] == J && x[k] <= 0.0) return refuse(c, "expected J above 0");
+    if (c->running && v[k] >= FIXED && v[k] < CURRENT) return refuse(c, "contact, x1_0 and x2_0 are set before the start");
   }
-  for (size_t k = 0; k < n; k++) memcpy((char *)c + places[v[k]], &x[k], sizeof(double));
+  for (size_t k = 0; k < n; k++) ((double *)c)[v[k]] = x[k];
   const double current = c->b.current;
   if (c->running) brake_outputs(&c->b);
   else brake_start(&c->b);
@@ -98,56 +96,48 @@ FMI(fmi3SetFloat64)(instance *c, const reference v[], size_t n, const double x[]
 }
 FMI(fmi3DoStep)(instance *c, double point, double size, _Bool final, _Bool *event, _Bool *ends, _Bool *early,
                 double *last) {
-  if (!(size > 0.0 && isfinite(size))) return refuse(c, "expected a step longer than 0 s");
+  if (!(c->running && size > 0.0 && isfinite(size))) return refuse(c, "expected a step longer than 0 s, after the start");
   *last = c->time, *event = *ends = *early = 0;
-  if (brake_step(&c->b, c->b.current, size)) return refuse(c, "no motion that can be computed: extreme parameters");
+  const int failed = brake_step(&c->b, c->b.current, size);
+  if (failed == 2) return refuse(c, "more than 100000 segments: the step is too long, or parameters are extreme");
+  if (failed) return refuse(c, "no finite motion: parameters are extreme");
   c->time = *last = point + size;
   return OK;
 }
 FMI(fmi3GetFMUState)(instance *c, void **kept) {
   if (!*kept && !(*kept = malloc(sizeof *c))) return refuse(c, "no memory");
-  memcpy(*kept, c, sizeof *c);
-  return OK;
+  return memcpy(*kept, c, sizeof *c), OK;
 }
 FMI(fmi3SetFMUState)(instance *c, void *kept) { return memcpy(c, kept, sizeof *c), OK; }
 FMI(fmi3FreeFMUState)(instance *c, void **kept) { return free(*kept), *kept = NULL, OK; }
 
 /* What this FMU has no use for. */
-#define KEYS instance *c, const reference v[], size_t n
-#define NONE(name, arguments) \
-  FMI(name) arguments { return refuse(c, #name ": this FMU does not have it"); }
-#define NO_TYPE(name, type) \
-  NONE(fmi3Get##name, (KEYS, type x[], size_t m)) \
-  NONE(fmi3Set##name, (KEYS, const type x[], size_t m))
-NO_TYPE(Float32, float) NO_TYPE(Int8, int8_t) NO_TYPE(UInt8, uint8_t) NO_TYPE(Int16, int16_t) NO_TYPE(UInt16, uint16_t)
-NO_TYPE(Int32, int32_t) NO_TYPE(UInt32, uint32_t) NO_TYPE(Int64, int64_t) NO_TYPE(UInt64, uint64_t)
-NO_TYPE(Boolean, _Bool) NO_TYPE(String, text)
 typedef const uint8_t *binary;
-NONE(fmi3GetVariableDependencies, (instance *c, reference v, size_t a[], reference b[], size_t d[], int e[], size_t n))
-NONE(fmi3UpdateDiscreteStates, (instance *c, _Bool *d, _Bool *e, _Bool *f, _Bool *g, _Bool *h, double *time))
-NONE(fmi3DeserializeFMUState, (instance *c, const uint8_t x[], size_t size, void **kept))
-NONE(fmi3GetNumberOfVariableDependencies, (instance *c, reference v, size_t *n)) NONE(fmi3GetClock, (KEYS, _Bool x[]))
-NONE(fmi3SerializeFMUState, (instance *c, void *kept, uint8_t x[], size_t size))
-NONE(fmi3GetOutputDerivatives, (KEYS, const int32_t o[], double x[], size_t m))
-NONE(fmi3SetBinary, (KEYS, const size_t sizes[], const binary x[], size_t m))
-NONE(fmi3SetIntervalFraction, (KEYS, const uint64_t x[], const uint64_t y[]))
-NONE(fmi3CompletedIntegratorStep, (instance *c, _Bool d, _Bool *e, _Bool *f))
-NONE(fmi3ActivateModelPartition, (instance *c, reference clock, double time))
-NONE(fmi3GetIntervalFraction, (KEYS, uint64_t x[], uint64_t y[], int z[])) NONE(fmi3GetShiftDecimal, (KEYS, double x[]))
-NONE(fmi3SetShiftFraction, (KEYS, const uint64_t x[], const uint64_t y[])) NONE(fmi3SetTime, (instance *c, double time))
-NONE(fmi3SerializedFMUStateSize, (instance *c, void *kept, size_t *size)) NONE(fmi3SetClock, (KEYS, const _Bool x[]))
-NONE(fmi3SetContinuousStates, (instance *c, const double x[], size_t n))
-NONE(fmi3GetBinary, (KEYS, size_t sizes[], binary x[], size_t m)) NONE(fmi3SetIntervalDecimal, (KEYS, const double x[]))
-NONE(fmi3GetNumberOfContinuousStates, (instance *c, size_t *n)) NONE(fmi3SetShiftDecimal, (KEYS, const double x[]))
-NONE(fmi3GetShiftFraction, (KEYS, uint64_t x[], uint64_t y[])) NONE(fmi3GetIntervalDecimal, (KEYS, double x[], int y[]))
-NONE(fmi3GetNumberOfEventIndicators, (instance *c, size_t *n))
+#define KEYS const reference v[], size_t n
+#define NONE(name, ...) \
+  FMI(fmi3##name)(instance *c, __VA_ARGS__) { return refuse(c, "fmi3" #name ": this FMU does not have it"); }
+#define NO_TYPE(name, type) NONE(Get##name, KEYS, type x[], size_t m) NONE(Set##name, KEYS, const type x[], size_t m)
+#define NO_STATES(name) NONE(name, double x[], size_t n)
 #define NO_DERIVATIVE(name) \
-  NONE(name, (instance *c, const reference u[], size_t n, const reference k[], size_t m, \
-              const double seed[], size_t seeds, double x[], size_t xs))
-NO_DERIVATIVE(fmi3GetDirectionalDerivative) NO_DERIVATIVE(fmi3GetAdjointDerivative)
-#define NO_MODE(name) NONE(name, (instance *c))
-NO_MODE(fmi3EnterConfigurationMode) NO_MODE(fmi3ExitConfigurationMode) NO_MODE(fmi3EnterEventMode)
-NO_MODE(fmi3EvaluateDiscreteStates) NO_MODE(fmi3EnterContinuousTimeMode) NO_MODE(fmi3EnterStepMode)
-#define NO_STATES(name) NONE(name, (instance *c, double x[], size_t n))
-NO_STATES(fmi3GetContinuousStateDerivatives) NO_STATES(fmi3GetEventIndicators) NO_STATES(fmi3GetContinuousStates)
-NO_STATES(fmi3GetNominalsOfContinuousStates)
+  NONE(name, KEYS, const reference k[], size_t m, const double seed[], size_t seeds, double x[], size_t xs)
+#define NO_MODE(name) \
+  FMI(fmi3##name)(instance *c) { return refuse(c, "fmi3" #name ": this FMU does not have it"); }
+NONE(GetVariableDependencies, reference v, size_t a[], reference b[], size_t d[], int e[], size_t n)
+NONE(UpdateDiscreteStates, _Bool *d, _Bool *e, _Bool *f, _Bool *g, _Bool *h, double *time) NO_STATES(GetEventIndicators)
+NONE(GetOutputDerivatives, KEYS, const int32_t o[], double x[], size_t m) NONE(SetShiftDecimal, KEYS, const double x[])
+NONE(SetBinary, KEYS, const size_t sizes[], const binary x[], size_t m) NONE(SetIntervalDecimal, KEYS, const double x[])
+NONE(SetIntervalFraction, KEYS, const uint64_t x[], const uint64_t y[]) NONE(GetNumberOfContinuousStates, size_t *n)
+NONE(DeserializeFMUState, const uint8_t x[], size_t size, void **kept) NONE(GetNumberOfEventIndicators, size_t *n)
+NONE(GetIntervalFraction, KEYS, uint64_t x[], uint64_t y[], int z[]) NONE(GetIntervalDecimal, KEYS, double x[], int y[])
+NONE(SetShiftFraction, KEYS, const uint64_t x[], const uint64_t y[]) NO_STATES(GetContinuousStateDerivatives)
+NONE(GetNumberOfVariableDependencies, reference v, size_t *n) NONE(CompletedIntegratorStep, _Bool d, _Bool *e, _Bool *f)
+NONE(SerializeFMUState, void *kept, uint8_t x[], size_t size) NONE(ActivateModelPartition, reference clock, double time)
+NONE(GetBinary, KEYS, size_t sizes[], binary x[], size_t m) NONE(GetShiftFraction, KEYS, uint64_t x[], uint64_t y[])
+NONE(SerializedFMUStateSize, void *kept, size_t *size) NONE(SetContinuousStates, const double x[], size_t n)
+NO_STATES(GetNominalsOfContinuousStates) NONE(GetShiftDecimal, KEYS, double x[]) NO_DERIVATIVE(GetDirectionalDerivative)
+NONE(SetClock, KEYS, const _Bool x[]) NO_DERIVATIVE(GetAdjointDerivative) NO_MODE(EnterContinuousTimeMode)
+NONE(GetClock, KEYS, _Bool x[]) NO_MODE(EnterConfigurationMode) NO_MODE(EvaluateDiscreteStates) NO_TYPE(Float32, float)
+NO_STATES(GetContinuousStates) NO_MODE(ExitConfigurationMode) NONE(SetTime, double time) NO_TYPE(UInt16, uint16_t)
+NO_TYPE(UInt32, uint32_t) NO_TYPE(UInt64, uint64_t) NO_TYPE(UInt8, uint8_t) NO_TYPE(Int16, int16_t)
+NO_TYPE(Int32, int32_t) NO_TYPE(Int64, int64_t) NO_TYPE(Boolean, _Bool) NO_MODE(EnterEventMode) NO_MODE(EnterStepMode)
+NO_TYPE(Int8, int8_t) NO_TYPE(String, text)

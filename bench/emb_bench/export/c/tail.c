@@ -26,6 +26,6 @@ int brake_step(brake *b, double current, double dt) {
   const int passed = advance(b, current, dt);
   brake_outputs(b);
   if (passed && isfinite(b->angle + b->velocity + b->clamping_force + b->friction_torque + b->w + b->i)) return 0;
-  return *b = before, 1;
+  return *b = before, passed ? 1 : 2;
 }
 #endif
