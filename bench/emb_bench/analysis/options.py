@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from emb_bench.config.bench import Bench
@@ -77,8 +77,8 @@ class SearchOptions(QuestionOptions):
 
 
 @dataclass(frozen=True, eq=False)
-class EstimateOptions(SearchOptions):
-    """Options of an estimate."""
+class FitOptions(SearchOptions):
+    """Options of the parameters that are estimated."""
 
     method: str | None = option(None, "see above (default: oem; windows for a recording)", choices=tuple(METHODS))
     model: str | None = option(
@@ -101,10 +101,6 @@ class EstimateOptions(SearchOptions):
     )
     window: float = option(
         0.0, "length of the windows [s], with method windows (default: what the map says, or 0.5)", "X", kind=float
-    )
-    profile: bool = option(False, "likelihood profiles of all parameters (default: of those that are identified badly)")
-    last: str | Path | None = option(
-        None, "JSON of an earlier estimate or report, to say what has changed since", "FILE", kind=Path
     )
     map: str | Path | None = option(None, MAP, "FILE", kind=Path)
 
@@ -135,8 +131,23 @@ class EstimateOptions(SearchOptions):
 
 
 @dataclass(frozen=True, eq=False)
-class ExportOptions(EstimateOptions):
-    """Options of an export; those of the estimate are for a model."""
+class EstimateOptions(FitOptions):
+    """Options of an estimate."""
+
+    profile: bool = option(False, "likelihood profiles of all parameters (default: of those that are identified badly)")
+    last: str | Path | None = option(
+        None, "JSON of an earlier estimate or report, to say what has changed since", "FILE", kind=Path
+    )
+
+    @classmethod
+    def of(cls, fit: FitOptions) -> EstimateOptions:
+        """Those of a fit alone."""
+        return cls(**{one.name: getattr(fit, one.name) for one in fields(FitOptions)})
+
+
+@dataclass(frozen=True, eq=False)
+class FileOptions(Options):
+    """Options of an exported file."""
 
     topic: str | None = option(None, "of a table (default: /cycle, the control cycles)", "TOPIC")
     theta: str | Path | Mapping[str, float] | None = option(
@@ -149,6 +160,11 @@ class ExportOptions(EstimateOptions):
         kind=int,
         least=0,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class ExportOptions(FitOptions, FileOptions):
+    """Options of an export: those of its file first, then those of the fit, which are for a model."""
 
 
 @dataclass(frozen=True, eq=False)

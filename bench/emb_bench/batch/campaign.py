@@ -54,9 +54,10 @@ def run_campaign(paths: Sequence[Path], output: Path, options: CampaignOptions) 
             numbered = shared_out_on_ray(evaluate, sources, options.jobs, limit, options.ray)
         rows = mark_copies(in_order(sources, numbered))
         write_rows(beside, output.suffix.lower(), rows, options)
-    if chart is not None and not draw_chart(rows, options.names, chart):
+    found = summarise(rows, options, str(output))
+    if chart is not None and not draw_chart(rows, found, chart):
         mention(f"{chart}: not drawn: no run that the model fits identifies a parameter")
-    return summarise(rows, options, str(output))
+    return found
 
 
 def in_order(sources: Sequence[Source], numbered: Generator[tuple[int, Row | Lost], None, None]) -> list[Row]:

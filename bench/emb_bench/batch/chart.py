@@ -9,21 +9,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.analysis.several_runs import BEYOND, beyond, slope
+from emb_bench.analysis.several_runs import BEYOND, beyond
 from emb_bench.batch.row import Row, unit_of
-from emb_bench.batch.summary import CHANGES_WITH, condition_of, counting, is_usable, measured
+from emb_bench.batch.summary import CHANGES_WITH, Campaign, condition_of, counting, is_usable, measured, shown_as
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.figures import COLOURS, DASHED, drawn
 
 Floats = NDArray[np.float64]
 
 
-def draw_chart(rows: Sequence[Row], names: Sequence[str], path: Path) -> bool:
+def draw_chart(rows: Sequence[Row], c: Campaign, path: Path) -> bool:
     """Draw what is estimated, one row of axes a parameter, one column a condition; False if nothing is.
 
-    As in the summary, copies of a log and runs that the model does not fit are left out.
+    As in the summary ``c`` of the rows, copies of a log and runs that the model does not fit are left out.
     """
-    used = {name: found for name in names if (found := [row for row in counting(rows) if is_usable(row, name)])}
+    over = {name: p.estimate.over for name, p in c.parameters.items() if p.estimate is not None}
+    used = {name: [row for row in counting(rows) if is_usable(row, name)] for name in over}
     if not used:
         return False
     shown = [key for key in CHANGES_WITH if any(row.get(key) is not None for found in used.values() for row in found)]
@@ -34,17 +35,21 @@ def draw_chart(rows: Sequence[Row], names: Sequence[str], path: Path) -> bool:
         for name, line in zip(used, axes, strict=True):
             values, deviations = measured(used[name], name)
             for key, axis in zip(shown, line, strict=True):
-                known, at = condition_of(used[name], key, begun)
-                _draw(axis, name, np.array(at), values, deviations, known)
+                (known, at), found = condition_of(used[name], key, begun), over[name].get(key)
+                unit_size = shown_as(key, c.span)[2]
+                slope = found.slope * unit_size if found is not None and found.significant else None
+                _draw(axis, name, np.array(at) / unit_size, values, deviations, known, slope)
         for key, axis in zip(shown, axes[-1], strict=True):
-            label, unit = CHANGES_WITH[key]
+            label, unit, _ = shown_as(key, c.span)
             axis.locator_params(axis="x", nbins=5)
             axis.set_xlabel(f"{label}{' since the first run' if key == 'start_time' else ''} [{unit}]")
     return True
 
 
-def _draw(axis: Any, name: str, at: Floats, values: Floats, deviations: Floats, known: Sequence[int]) -> None:
-    """One parameter against one condition, which the ``known`` runs have; a line where the slope is significant."""
+def _draw(
+    axis: Any, name: str, at: Floats, values: Floats, deviations: Floats, known: Sequence[int], slope: float | None
+) -> None:
+    """One parameter against one condition, which the ``known`` runs have; a line where there is a ``slope``."""
     median, out = float(np.median(values)), np.isin(known, beyond(values.tolist(), deviations.tolist()))
     reference, factor, label = 0.0, 1.0, f"{name} [{unit_of(name, 'SI')}]"
     if PARAMETERS[name].relative:
@@ -55,11 +60,10 @@ def _draw(axis: Any, name: str, at: Floats, values: Floats, deviations: Floats, 
     axis.axhline(factor * (median - reference), **DASHED | {"linestyle": "-"})
     for where, marker, colour in ((~out, "o", COLOURS[0]), (out, "X", COLOURS[1])):
         axis.plot(at[where], factor * (y[where] - reference), marker, color=colour, markersize=4.5)
-    found = slope(y.tolist(), deviations[known].tolist(), at.tolist())
-    if found is not None and found.significant:
+    if slope is not None:
         weights = deviations[known] ** -2.0
         ends = np.array([at.min(), at.max()])
         middle = (np.average(at, weights=weights), np.average(y, weights=weights))
-        axis.plot(ends, factor * (middle[1] + found.slope * (ends - middle[0]) - reference), color=COLOURS[2])
+        axis.plot(ends, factor * (middle[1] + slope * (ends - middle[0]) - reference), color=COLOURS[2])
     if axis.get_subplotspec().is_first_col():
         axis.set_ylabel(label)

@@ -23,9 +23,9 @@ from emb_runtime.numbers import NOTHING, plain
 
 SHOWN = 3  # Most logs of a kind that are named without ``-v``
 OF_AN_ESTIMATE = ("estimate", "low", "high", "between_runs", "repeatability")
-CHANGES_WITH = {"start_time": ("time", "h")} | {name: (one.label, one.unit) for name, one in CONDITIONS.items()}
-"""Columns that a parameter may change with: what they are, and their unit."""
+CHANGES_WITH = ("start_time", *CONDITIONS)  # Columns that a parameter may change with
 HOUR = 3.6e12  # [ns]
+TIMES = {"d": 24.0, "h": 1.0, "min": 1.0 / 60.0, "s": 1.0 / 3600.0}  # Units in which time is shown [h]
 OVER_RUNS = f"The mean is weighted by information, total and repeatability are medians. {INTERVALS}"
 
 
@@ -70,6 +70,7 @@ class Campaign:
     violating: int
     method: str
     models: tuple[str, ...]
+    span: float  # Time from the start of the first run to that of the last [h]
     parameters: dict[str, ParameterSummary]
 
 
@@ -77,6 +78,7 @@ def summarise(rows: Sequence[Row], options: CampaignOptions, result: str) -> Cam
     """Summary of a campaign; numbers may be infinite."""
     good = [row for row in rows if row["error"] is None]
     counted = counting(rows)
+    starts = [row["start_time"] for row in counted if row.get("start_time") is not None]
     return Campaign(
         result=result,
         logs=len(rows),
@@ -91,6 +93,7 @@ def summarise(rows: Sequence[Row], options: CampaignOptions, result: str) -> Cam
         violating=sum(bool(row.get("violations")) for row in good),
         method=options.method,
         models=tuple(sorted({row["model"] for row in good if row.get("model") is not None})),
+        span=(max(starts) - min(starts)) / HOUR if starts else 0.0,
         parameters={name: _parameter(counted, name) for name in options.names},
     )
 
@@ -153,6 +156,17 @@ def measured(used: Sequence[Row], name: str) -> tuple[NDArray[np.float64], NDArr
     """Estimates of a parameter and their deviations between runs, SI units."""
     found = _columns(used, name)
     return found["estimate"], found["between_runs"]
+
+
+def shown_as(key: str, span: float) -> tuple[str, str, float]:
+    """Name and unit in which a column of ``CHANGES_WITH`` is shown, and this unit in that of its slope.
+
+    Time is shown in the largest unit of which the ``span`` of the runs [h] has two.
+    """
+    if key in CONDITIONS:
+        return CONDITIONS[key].label, CONDITIONS[key].unit, 1.0
+    unit = next((name for name, hours in TIMES.items() if span >= 2.0 * hours), "s")
+    return "time", unit, TIMES[unit]
 
 
 def condition_of(used: Sequence[Row], key: str, begun: int) -> tuple[list[int], list[float]]:
@@ -229,10 +243,11 @@ def _trend(c: Campaign) -> Iterator[str]:
             continue
         for key, one in p.estimate.over.items():
             if one.significant:
-                share = one.slope / abs(p.estimate.median) if p.relative else one.slope
-                size = f"{signed(100.0 * share)} %" if p.relative else f"{signed(share)} {p.unit}"
-                label, unit = CHANGES_WITH[key]
-                yield f"{name} changes with {label}: {size} per {unit} ({p_value(one.p_value)})"
+                label, unit, unit_size = shown_as(key, c.span)
+                change, of = one.slope * unit_size, p.unit
+                if p.relative:
+                    change, of = 100.0 * change / abs(p.estimate.median), "%"
+                yield f"{name} changes with {label}: {signed(change)} {of} per {unit} ({p_value(one.p_value)})"
         if p.estimate.beyond:
             logs = ", ".join(p.estimate.beyond[:SHOWN]) + (" ..." if len(p.estimate.beyond) > SHOWN else "")
             yield f"{name}: beyond the control limits (3 deviations between runs from the median): {logs}"

@@ -15,7 +15,8 @@ from pyarrow import parquet
 
 from emb_bench.analysis.several_runs import beyond, slope
 from emb_bench.batch.chart import draw_chart
-from emb_bench.batch.row import Row
+from emb_bench.batch.row import CampaignOptions, Row
+from emb_bench.batch.summary import summarise, text
 from emb_bench.logs.log import read_log
 from emb_runtime.can.messages import load_layout
 from emb_runtime.log.recorder_process import LogWriter
@@ -122,13 +123,17 @@ def test_a_mapped_drive_s_own_signals_are_read_from_its_bus_where_they_can_be_be
         assert read_log(path).conditions == pytest.approx(expected)
 
 
-def rows_of(values: list[float]) -> list[Row]:
+OF_K_M_AND_F_V = CampaignOptions(params="k_m,f_v")
+
+
+def rows_of(values: list[float], apart: float = 3600.0) -> list[Row]:
+    """Rows of runs that are so many seconds apart."""
     return [
         {
             "log": f"{n}.mcap",
             "error": None,
             "fits": True,
-            "start_time": n * 3_600_000_000_000,
+            "start_time": n * round(apart * 1e9),
             "temperature": 20.0 + n,
             "k_m_identified": False,
             "f_v_identified": True,
@@ -139,14 +144,25 @@ def rows_of(values: list[float]) -> list[Row]:
     ]
 
 
-def test_a_chart_has_the_conditions_that_were_sent_the_limits_and_the_runs_beyond_them(tmp_path: Path) -> None:
-    path = tmp_path / "chart.svg"
+@pytest.mark.parametrize(
+    ("apart", "unit", "change"), [(0.5, "s", 16.7), (30.0, "min", 16.7), (1800.0, "h", 16.7), (86400.0, "d", 8.33)]
+)
+def test_a_chart_has_the_conditions_that_were_sent_the_limits_and_the_runs_beyond_them(
+    apart: float, unit: str, change: float, tmp_path: Path
+) -> None:
+    path, rows = tmp_path / "chart.svg", rows_of([1.0, 1.1, 1.2, 1.3, 1.4], apart)
+    found = summarise(rows, OF_K_M_AND_F_V, "rows.csv")
+    said = " ".join(text(found).split())
+    assert f"f_v changes with time: +{change} % per {unit} (p <" in said
+    assert "f_v changes with temperature: +8.33 % per °C" in said
+    assert "f_v: beyond the control limits (3 deviations between runs from the median): 0.mcap, 1.mcap, 3." in said
     with rc_context({"svg.fonttype": "none"}):
-        assert draw_chart(rows_of([2.0, 2.01, 1.99, 2.0, 2.2]), ["k_m", "f_v"], path)
+        assert draw_chart(rows, found, path)
     shown = " ".join(ElementTree.parse(path).getroot().itertext())
-    assert all(text in shown for text in ("time since the first run [h]", "temperature [°C]", "f_v − median [%]"))
+    assert all(text in shown for text in (f"time since the first run [{unit}]", "temperature [°C]", "f_v − median [%]"))
     assert not any(text in shown for text in ("supply voltage", "k_m"))
-    assert not draw_chart([row | {"fits": False} for row in rows_of([2.0])], ["f_v"], tmp_path / "none.png")
+    rows = [row | {"fits": False} for row in rows]
+    assert not draw_chart(rows, summarise(rows, OF_K_M_AND_F_V, "rows.csv"), tmp_path / "none.png")
     assert not (tmp_path / "none.png").exists()
 
 
