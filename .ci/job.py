@@ -1,7 +1,8 @@
 """Runs the job that docs/howto/kernel-with-can.md has to copy, as the page has it: ``job.py DIST``.
 
 As root it runs in a Debian of its own, which debootstrap makes; else, or where that cannot be made or mounted (in a
-container), in an empty folder without the environment. Each run of the page's table must end with its exit codes.
+container), in an empty folder without the environment, which then has what the page puts into /opt. Only root installs
+packages. Each run of the page's table must end with its exit codes.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ def debian(root: Path) -> list[str]:
     """What begins a command in a new Debian with this computer's network; empty where there can be none."""
     make = ["debootstrap", "--variant=minbase", "bookworm", str(root)]
     for command in (["unshare", "--mount", "true"], make):
-        if os.geteuid() != 0 or subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode != 0:
+        is_possible = os.geteuid() == 0 and shutil.which(command[0])
+        if not is_possible or subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode != 0:
             return []
     shutil.copy("/etc/resolv.conf", root / "etc")
     mounts = f'mount -t proc proc {root}/proc && mount -t tmpfs tmpfs {root}/dev/shm && exec chroot {root} "$@"'
@@ -73,7 +75,8 @@ def main(dist: Path) -> None:
         def play(command: str) -> int:
             path = ":".join([*(work / "paths").read_text().split(), "/usr/sbin:/usr/bin:/sbin:/bin"])
             variables = [f"{key}={value}" for key, value in (environment | {"PATH": path}).items()]
-            line = [*enter, "env", "-i", *variables, "bash", "-e", "-c", f"cd {place} && {command}"]
+            here = command if own else command.replace("/opt", str(place))
+            line = [*enter, "env", "-i", *variables, "bash", "-e", "-c", f"cd {place} && {here}"]
             begin = time.monotonic()
             code = subprocess.run(line, check=False).returncode
             show(f"{time.monotonic() - begin:.0f} s, exit code {code}: {command}")

@@ -166,6 +166,10 @@ class FileOptions(Options):
 class ExportOptions(FitOptions, FileOptions):
     """Options of an export: those of its file first, then those of the fit, which are for a model."""
 
+    method: str | None = option(
+        None, "of the estimate (default: oem; windows for a recording)", choices=("oem", "pem", "windows")
+    )  # by rls no model fits
+
 
 @dataclass(frozen=True, eq=False)
 class ReportOptions(EstimateOptions):

@@ -239,7 +239,7 @@ COMMANDS: Mapping[str, Command] = {
         options=api.ExportOptions,
         output="file to write: a picture (.png, .svg, .pdf), a table (.csv, .parquet) or a model (.fmu, .c, .dcm, "
         ".xml) by its ending",
-        more=f"\nThe options behind --draw are those of the estimate of a model.\n{UNKNOWNS}",
+        more="\nThe options behind --draw are those of the estimate of a model: see the help of emb-replay estimate.\n",
     ),
     "campaign": Command(
         api.campaign,

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from emb_bench.export.identified import Identified
+from emb_bench.export.identified import CHOSEN, Identified
 from emb_bench.output import replacing
 
 
 def dcm(found: Identified) -> str:
-    """The text of the file; the 95 % interval of a parameter is in a comment."""
+    """The text of the file: what is of the brake, each with its 95 % interval in a comment."""
     lines = ["KONSERVIERUNG_FORMAT 2.0", "* Made by emb-excite", f"* parameters: {found.source}"]
-    for one in found.parameters():
+    for one in (one for one in found.parameters() if one.name not in CHOSEN):
         lines += ["", f"FESTWERT {one.name}", f'   LANGNAME "{one.about}"', f'   EINHEIT_W "{one.unit}"']
         lines += [f"   WERT {one.value!r}", f"* {one.known}", "END"]
     return "\n".join([*lines, ""])

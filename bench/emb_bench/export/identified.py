@@ -51,7 +51,7 @@ ABOUT: Mapping[str, str] = {
     "x2_0": "velocity at the start",
 }
 """Parameters of an exported brake."""
-_CHOSEN = ("x1_0", "x2_0", "tolerance")  # What is of a simulation, not of the brake
+CHOSEN = ("x1_0", "x2_0", "tolerance")  # What is of a simulation, not of the brake
 UNITS = SI | {"gamma": "m", "stribeck_exponent": "1", "hysteresis_travel": "rad", "tolerance": "rad/s"}
 _UNSAFE = re.compile(r"[^\w .,=+-]", re.ASCII)  # What a name must not bring into comments of C, XML and DCM
 
@@ -108,7 +108,7 @@ class Identified:
         if name in self.intervals:
             low, high = self.intervals[name]
             return f"95 %: {low:.5g} to {high:.5g}"
-        return "chosen" if name in _CHOSEN else "not estimated"
+        return "chosen" if name in CHOSEN else "not estimated"
 
 
 def ascii_unit(unit: str) -> str:

@@ -506,7 +506,8 @@ def drift(d: Drift) -> str:
     if not d.drifted:
         return f"no significant change since {since} (detection limit {size(d.detectable)})"
     way = "rose" if d.sigmas > 0 else "fell"
-    return f"{way} by {size(abs(d.relative_change))} ({abs(d.sigmas):.2g} sigma) since {since}"
+    sigmas = f"{abs(d.sigmas):{'.2g' if abs(d.sigmas) < 10.0 else '.0f'}}"
+    return f"{way} by {size(abs(d.relative_change))} ({sigmas} sigma) since {since}"
 
 
 def held_out(h: HeldOut) -> str:

@@ -30,7 +30,7 @@ from emb_bench.estimate.records import Unknown, searched
 from emb_bench.experiment.simulate import Theta
 from emb_bench.export.c_source import OUTPUTS, c_source
 from emb_bench.export.fmu import write_fmu
-from emb_bench.export.identified import Identified, drawn
+from emb_bench.export.identified import CHOSEN, Identified, drawn
 from emb_bench.sim.open_loop import held, march, trajectory
 from emb_runtime.config.bench import PARAMETER_NAMES
 
@@ -308,6 +308,7 @@ def test_a_calibration_file_has_each_value_with_its_unit_and_interval(log: Path,
         row = found[c.label]
         assert float(row["WERT"]) == c.value
         assert row["*"] == "95 %: {:.5g} to {:.5g}".format(*c.interval)
+    assert not {*CHOSEN} & {*found}
     assert found["f_v"]["EINHEIT_W"] == "N.m.s/rad"
     assert found["T_c"]["LANGNAME"] == "Coulomb friction"
 
@@ -351,13 +352,13 @@ def test_a_seed_draws_the_same_brake_again(tmp_path: Path) -> None:
 
 
 def test_features_that_are_estimated_are_exported(log: Path, tmp_path: Path) -> None:
-    options = api.EstimateOptions(nuisance="quadratic,contact", starts=1)
-    api.export(log, tmp_path / "brake.fmu", **vars(options))
+    options = api.ExportOptions(nuisance="quadratic,contact", starts=1)
+    api.export(log, tmp_path / "brake.fmu", options)
     shown = {v.name: v for v in fmpy.read_model_description(tmp_path / "brake.fmu").modelVariables}
     for name in ("quadratic", "contact"):
         assert float(shown[name].start) != 0.0
         assert "; 95 %: " in shown[name].description
-    assert "without quadratic, contact, parameters" in api.export(log, tmp_path / "brake.xml", **vars(options))
+    assert "without quadratic, contact, parameters" in api.export(log, tmp_path / "brake.xml", options)
 
 
 def test_a_misfit_or_what_is_not_identified_is_refused_before_anything_is_written(
