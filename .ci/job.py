@@ -55,6 +55,8 @@ def main(dist: Path) -> None:
     *installs, run, report = (
         step["run"] for step in yaml.safe_load(workflow)["jobs"]["brake"]["steps"] if "run" in step
     )
+    made = re.findall(r"^RUN (.*)$", blocks("dockerfile", page)[0], re.MULTILINE)
+    assert made == [one.replace(" dist ", " /dist ") for one in installs[:2]], "the image is not made as the job is"
     with tempfile.TemporaryDirectory(prefix="job-") as name:
         root = Path(name) / "root"
         enter = debian(root)
