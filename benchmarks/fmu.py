@@ -27,7 +27,7 @@ from emb_bench.compiled import compiled
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import EULER, Mechanics
 from emb_bench.experiment.simulate import Theta
-from emb_bench.export.fmu import write_fmu
+from emb_bench.export.export import write_model
 from emb_bench.export.identified import Identified
 from emb_bench.sim.open_loop import held, march, trajectory
 
@@ -78,7 +78,7 @@ def main() -> None:
         subprocess.run(["cc", "-O2", "-shared", "-fPIC", "-o", library, source], check=True)
         drive = ctypes.CDLL(str(library)).drive
         for mechanics, name in plants.items():
-            write_fmu(Identified(name, bench, bench.brake, mechanics), path)
+            write_model(Identified(name, bench, bench.brake, mechanics), path)
             model = fmpy.read_model_description(path)
             keys = {variable.name: variable.valueReference for variable in model.modelVariables}
             unpacked = fmpy.extract(path, str(Path(folder, name)))

@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import textwrap
 from importlib.resources import files
-from pathlib import Path
 
 from emb_bench.export.identified import Identified
-from emb_bench.output import replacing
 
 OUTPUTS = {
     "angle": ("rad", "angle of the motor"),
@@ -42,11 +40,3 @@ def c_source(found: Identified) -> str:
     plant = part("exact.c" if found.plain else "extended.c")
     head = part("head.c").replace("@fields@", f"  double {names};")
     return f"/* {about} */\n{head}{plant}{part('tail.c').replace('@values@', values)}"
-
-
-def write_c(found: Identified, path: Path) -> str:
-    """Write the C of a brake; says which parameters it has."""
-    text = c_source(found)
-    with replacing(path) as beside:
-        beside.write_text(text, encoding="utf-8")
-    return f"C source, parameters: {found.source}"

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from emb_bench.export.identified import CHOSEN, Identified
-from emb_bench.output import replacing
 
 
 def dcm(found: Identified) -> str:
@@ -15,11 +12,3 @@ def dcm(found: Identified) -> str:
         lines += ["", f"FESTWERT {one.name}", f'   LANGNAME "{one.about}"', f'   EINHEIT_W "{one.unit}"']
         lines += [f"   WERT {one.value!r}", f"* {one.known}", "END"]
     return "\n".join([*lines, ""])
-
-
-def write_dcm(found: Identified, path: Path) -> str:
-    """Write the calibration file; says which parameters it has."""
-    text = dcm(found)
-    with replacing(path) as beside:
-        beside.write_text(text, encoding="ascii")
-    return f"a calibration file, parameters: {found.source}"

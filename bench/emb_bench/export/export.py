@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import NDArray
 
 from emb_bench.analysis.options import ExportOptions
-from emb_bench.export.c_source import write_c
-from emb_bench.export.dcm import write_dcm
-from emb_bench.export.fmu import write_fmu
-from emb_bench.export.identified import identified
-from emb_bench.export.mjcf import write_mjcf
+from emb_bench.export.c_source import c_source
+from emb_bench.export.dcm import dcm
+from emb_bench.export.fmu import fmu
+from emb_bench.export.identified import Identified, identified
+from emb_bench.export.mjcf import mjcf
 from emb_bench.export.picture import draw_run
 from emb_bench.figures import PICTURES
 from emb_bench.logs.log import UNIX_TIME, RunLog
@@ -64,22 +64,15 @@ def arrow_batches(log: RunLog, topic: str) -> tuple[Any, Iterator[Any]]:
     return schema, rows
 
 
-def write_parquet(log: RunLog, topic: str, path: Path) -> str:
-    """Write one topic as Parquet, see :func:`arrow_batches`; describes the content."""
-    schema, tables = arrow_batches(log, topic)
-    from pyarrow import parquet
+def write_table(log: RunLog, topic: str, path: Path) -> str:
+    """Write one topic as Parquet or CSV, by the ending of the file; says what it holds.
 
-    with replacing(path) as beside, parquet.ParquetWriter(beside, schema) as writer:
-        for table in tables:
-            writer.write_table(table)
-    return f"{log.counts[topic]} rows of {topic}"
-
-
-def write_csv(log: RunLog, topic: str, path: Path) -> str:
-    """Write one topic as CSV: units in the head, bytes as hex, times in nanoseconds since 1970; says what it holds."""
+    Parquet is as :func:`arrow_batches` describes. CSV has units in its head, bytes as hex, times in nanoseconds since
+    1970.
+    """
     schema, tables = arrow_batches(log, topic)
     import pyarrow as pa
-    from pyarrow import csv
+    from pyarrow import csv, parquet
 
     def plain(column: Any) -> Any:
         if pa.types.is_binary(column.type):
@@ -88,16 +81,38 @@ def write_csv(log: RunLog, topic: str, path: Path) -> str:
             return text_cells(column)
         return column.cast(pa.int64()) if pa.types.is_timestamp(column.type) else column
 
-    titles = text_cells(pa.array([column.title for column in log.describe(topic)], pa.string())).to_pylist()
-    head = pa.table([plain(column) for column in schema.empty_table()], titles)
-    with replacing(path) as beside, csv.CSVWriter(beside, head.schema) as writer:
+    writer, empty = parquet.ParquetWriter, schema.empty_table()
+    if path.suffix.lower() == ".csv":
+        titles = text_cells(pa.array([column.title for column in log.describe(topic)], pa.string())).to_pylist()
+        writer, tables = csv.CSVWriter, (pa.table([plain(column) for column in table], titles) for table in tables)
+        empty = pa.table([plain(column) for column in empty], titles)
+    with replacing(path) as beside, writer(beside, empty.schema) as file:
         for table in tables:
-            writer.write_table(pa.table([plain(column) for column in table], titles))
+            file.write_table(table)
     return f"{log.counts[topic]} rows of {topic}"
 
 
-TABLES = {".csv": write_csv, ".parquet": write_parquet}
-MODELS = {".fmu": write_fmu, ".c": write_c, ".dcm": write_dcm, ".xml": write_mjcf, ".mjcf": write_mjcf}
+def write_model(found: Identified, path: Path) -> str:
+    """Write a brake as a model, by the ending of the file; says which parameters it has."""
+    content, what = MODELS[path.suffix.lower()](found)
+    with replacing(path) as beside:
+        beside.write_bytes(content)
+    return f"{what}, parameters: {found.source}"
+
+
+def _mjcf(found: Identified) -> tuple[bytes, str]:
+    lacks = f", without {', '.join(found.features)}" if found.features else ""
+    return mjcf(found.bench, found.brake).encode(), f"a MuJoCo model{lacks}"
+
+
+TABLES = (".csv", ".parquet")
+MODELS: Mapping[str, Callable[[Identified], tuple[bytes, str]]] = {
+    ".fmu": fmu,
+    ".c": lambda found: (c_source(found).encode(), "C source"),
+    ".dcm": lambda found: (dcm(found).encode("ascii"), "a calibration file"),
+    **dict.fromkeys((".xml", ".mjcf"), _mjcf),
+}
+"""Content of a model's file, and what it is in words, by the file's ending."""
 FORMATS = (*PICTURES, *TABLES, *MODELS)  # Endings of what is written
 CYCLE = "/cycle"
 
@@ -114,5 +129,5 @@ def write(log: RunLog, path: Path, asked: ExportOptions, estimate: Callable[[], 
         if getattr(asked, one.name) != one.default and ending not in endings:
             raise UsageError(f"--{one.name}: expected with a file that ends in {' or '.join(endings)}, got {path}")
     if ending in MODELS:
-        return MODELS[ending](identified(log, asked, estimate), path)
-    return TABLES[ending](log, asked.topic or CYCLE, path) if ending in TABLES else draw_run(log, path)
+        return write_model(identified(log, asked, estimate), path)
+    return write_table(log, asked.topic or CYCLE, path) if ending in TABLES else draw_run(log, path)

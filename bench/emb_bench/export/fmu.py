@@ -6,6 +6,7 @@ There is no model exchange: its importer integrates, and would step over a stand
 from __future__ import annotations
 
 import hashlib
+import io
 import math
 import os
 import platform
@@ -23,7 +24,6 @@ from xml.etree.ElementTree import Element, SubElement
 
 from emb_bench.export.c_source import OUTPUTS, c_source, part
 from emb_bench.export.identified import START, Identified
-from emb_bench.output import replacing
 
 NAME = "brake"  # Identifier of the model, and of its library
 TIME = "time"
@@ -35,8 +35,8 @@ _BASE: Mapping[str, Mapping[str, int]] = {
 _FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-s")  # rounded as the bench rounds
 
 
-def write_fmu(found: Identified, path: Path) -> str:
-    """Write the FMU; says which parameters it has, and whether it has a library."""
+def fmu(found: Identified) -> tuple[bytes, str]:
+    """The FMU, and what it is in words: with a library, or why without."""
     source = c_source(found)
     token = hashlib.sha256(source.encode()).hexdigest()
     inside = {
@@ -47,11 +47,11 @@ def write_fmu(found: Identified, path: Path) -> str:
     }
     place = f"binaries/{platform.machine()}-linux"
     library, reason = _library(inside)
-    with replacing(path) as beside, zipfile.ZipFile(beside, "w", zipfile.ZIP_DEFLATED) as archive:
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w") as archive:
         for name, content in (inside | ({f"{place}/{NAME}.so": library} if library else {})).items():
             archive.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED)
-    made = f"an FMU (FMI 3.0, co-simulation; {place})" if library else f"an FMU of sources alone: {reason}"
-    return f"{made}; parameters: {found.source}"
+    return made.getvalue(), f"an FMU ({f'FMI 3.0, co-simulation; {place}' if library else f'sources alone: {reason}'})"
 
 
 def description(found: Identified, token: str) -> Element:

@@ -61,7 +61,7 @@ class Parameter(NamedTuple):
 
     name: str
     value: float
-    unit: str  # SI, in ASCII
+    unit: str  # SI, as FMI writes it: ``N.m.s/rad``, ``kg.m2``
     about: str  # What it is, in ASCII
     known: str  # Its 95 % interval, or why it has none, in ASCII
     least: float  # What no value is below
@@ -99,21 +99,13 @@ class Identified:
         of_plant = {n: v for n, v in self.mechanics._asdict().items() if (n == "viscous_asymmetry") is self.plain}
         values = self.brake._asdict() | of_plant | dict.fromkeys(START, 0.0) | {"contact": self.contact}
         found = []
-        for name in values.keys() & ABOUT.keys():
-            low = least(name) if name in SI else 0.0
-            found.append(Parameter(name, values[name], ascii_unit(UNITS[name]), ABOUT[name], self._known(name), low))
-        return sorted(found, key=lambda one: list(ABOUT).index(one.name))
-
-    def _known(self, name: str) -> str:
-        if name in self.intervals:
-            low, high = self.intervals[name]
-            return f"95 %: {low:.5g} to {high:.5g}"
-        return "chosen" if name in CHOSEN else "not estimated"
-
-
-def ascii_unit(unit: str) -> str:
-    """A unit as FMI writes it: ``N.m.s/rad``, ``kg.m2``."""
-    return unit.replace("·", ".").replace("²", "2")
+        for name in (name for name in ABOUT if name in values):
+            known = "chosen" if name in CHOSEN else "not estimated"
+            if name in self.intervals:
+                known = "95 %: {:.5g} to {:.5g}".format(*self.intervals[name])
+            unit, low = UNITS[name].replace("·", ".").replace("²", "2"), least(name) if name in SI else 0.0
+            found.append(Parameter(name, values[name], unit, ABOUT[name], known, low))
+        return found
 
 
 def identified(log: RunLog, asked: ExportOptions, estimate: Callable[[], Study]) -> Identified:

@@ -7,10 +7,6 @@ friction loss is a soft constraint that acts from step to step: a reversal is as
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from emb_bench.export.identified import Identified
-from emb_bench.output import replacing
 from emb_runtime.config.bench import Bench, BrakeParameters
 
 STEPS = 10  # Of the simulation, per sample time
@@ -51,12 +47,3 @@ def mjcf(bench: Bench, brake: BrakeParameters) -> str:
     return _TEXT.format(
         p=brake, step=step, time_constant=2.0 * step, stiffness=brake.k_1 / brake.gamma, current=bench.limits.current
     )
-
-
-def write_mjcf(found: Identified, path: Path) -> str:
-    """Write the model of a brake; says which parameters it has, and which features it lacks."""
-    text = mjcf(found.bench, found.brake)
-    with replacing(path) as beside:
-        beside.write_text(text, encoding="utf-8")
-    lacks = f", without {', '.join(found.features)}" if found.features else ""
-    return f"a MuJoCo model{lacks}, parameters: {found.source}"

@@ -29,7 +29,7 @@ from emb_bench.config.plants import Mechanics
 from emb_bench.estimate.records import Unknown, searched
 from emb_bench.experiment.simulate import Theta
 from emb_bench.export.c_source import OUTPUTS, c_source
-from emb_bench.export.fmu import write_fmu
+from emb_bench.export.export import write_model
 from emb_bench.export.identified import CHOSEN, Identified, drawn
 from emb_bench.sim.open_loop import held, march, trajectory
 from emb_runtime.config.bench import PARAMETER_NAMES
@@ -97,7 +97,7 @@ def study(log: Path) -> Study:
 def test_an_fmu_moves_as_the_bench_simulates(name: str, tmp_path: Path) -> None:
     m, path = FEATURES[name], tmp_path / "brake.fmu"
     found = Identified("test", BENCH, BENCH.brake, m, contact=1.5)
-    assert "binaries/" in write_fmu(found, path)
+    assert "binaries/" in write_model(found, path)
     assert validate_fmu(str(path)) == []
     at_rest = 0
     for seed in range(3):
@@ -119,7 +119,7 @@ def test_an_fmu_moves_as_the_bench_simulates(name: str, tmp_path: Path) -> None:
 
 def test_every_parameter_of_an_fmu_can_be_set(tmp_path: Path) -> None:
     found = Identified("test", BENCH, BENCH.brake, FEATURES["play"])
-    write_fmu(found, tmp_path / "brake.fmu")
+    write_model(found, tmp_path / "brake.fmu")
     other = found.brake._replace(**{name: 1.2 * value for name, value in found.brake._asdict().items()})
     changed = Identified("test", BENCH, other, Mechanics(cubic=1e-5, play=0.3))
     start = {one.name: one.value for one in changed.parameters() if one.name in {p.name for p in found.parameters()}}
@@ -132,7 +132,7 @@ def test_an_fmu_has_all_functions_of_fmi_3_in_at_most_400_lines(tmp_path: Path) 
     names = set(re.findall(r"FMI3_Export (fmi3\w+)TYPE", header))
     assert len(names) > 70
     for name, mechanics in FEATURES.items():
-        write_fmu(Identified("test", BENCH, BENCH.brake, mechanics), tmp_path / "brake.fmu")
+        write_model(Identified("test", BENCH, BENCH.brake, mechanics), tmp_path / "brake.fmu")
         folder = Path(fmpy.extract(str(tmp_path / "brake.fmu"), str(tmp_path / name)))
         library = ctypes.CDLL(str(next(folder.glob("binaries/*/brake.so"))))
         assert not [name for name in names if not hasattr(library, name)]
@@ -143,7 +143,7 @@ def test_an_fmu_has_all_functions_of_fmi_3_in_at_most_400_lines(tmp_path: Path) 
 def test_an_importer_can_step_back_reset_and_is_refused_what_is_no_step(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_fmu(Identified("test", BENCH, BENCH.brake, Mechanics()), tmp_path / "brake.fmu")
+    write_model(Identified("test", BENCH, BENCH.brake, Mechanics()), tmp_path / "brake.fmu")
     model = fmpy.read_model_description(tmp_path / "brake.fmu")
     unpacked = fmpy.extract(str(tmp_path / "brake.fmu"), str(tmp_path / "unpacked"))
     keys = {v.name: v.valueReference for v in model.modelVariables}
@@ -237,7 +237,7 @@ COMPILERS = [
 
 @pytest.mark.parametrize("name", FEATURES)
 def test_compilers_take_the_c_without_a_warning_and_c_links_with_cpp(name: str, tmp_path: Path) -> None:
-    write_fmu(Identified("test", BENCH, BENCH.brake, FEATURES[name]), tmp_path / "brake.fmu")
+    write_model(Identified("test", BENCH, BENCH.brake, FEATURES[name]), tmp_path / "brake.fmu")
     folder = Path(fmpy.extract(str(tmp_path / "brake.fmu"), str(tmp_path / "unpacked"))) / "sources"
     for compiler, flags, source in COMPILERS:
         if compiler != "clang" or shutil.which(compiler):
@@ -395,7 +395,7 @@ def test_without_a_compiler_that_works_an_fmu_has_sources_alone(
         (tmp_path / "cc").write_text(script, encoding="utf-8")
         (tmp_path / "cc").chmod(0o755)
     said = replay.text("export", log, "-o", tmp_path / "x.fmu", "--theta", "nominal")
-    assert said.startswith(f"{tmp_path / 'x.fmu'}: an FMU of sources alone: ")
+    assert said.startswith(f"{tmp_path / 'x.fmu'}: an FMU (sources alone: ")
     assert reason in said
     assert validate_fmu(str(tmp_path / "x.fmu")) == []
     with zipfile.ZipFile(tmp_path / "x.fmu") as archive:
