@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 from emb_bench.config.bench import Bench
@@ -138,11 +138,6 @@ class EstimateOptions(FitOptions):
     last: str | Path | None = option(
         None, "JSON of an earlier estimate or report, to say what has changed since", "FILE", kind=Path
     )
-
-    @classmethod
-    def of(cls, fit: FitOptions) -> EstimateOptions:
-        """Those of a fit alone."""
-        return cls(**{one.name: getattr(fit, one.name) for one in fields(FitOptions)})
 
 
 @dataclass(frozen=True, eq=False)

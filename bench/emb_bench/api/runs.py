@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary, finalize
 
 from numpy.typing import NDArray
 
-from emb_bench.analysis.options import EstimateOptions, ExportOptions
+from emb_bench.analysis.options import ExportOptions, FitOptions
 from emb_bench.api.arguments import AnyRun, listed, opened, options_of
 from emb_bench.figures import for_notebook
 from emb_bench.logs.log import RunLog, read_log
@@ -170,7 +170,8 @@ def export(run: AnyRun, output: str | Path, options: ExportOptions | None = None
 
     asked = options_of("export", ExportOptions, options, more)
     log = opened(run, asked.map)
-    return write(log, Path(output), asked, lambda: estimate(log, EstimateOptions.of(asked)))
+    of_fit = {one.name: getattr(asked, one.name) for one in fields(FitOptions)}
+    return write(log, Path(output), asked, lambda: estimate(log, **of_fit))
 
 
 def rerun(run: AnyRun) -> Rerun:

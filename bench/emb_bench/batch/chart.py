@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from emb_bench.analysis.several_runs import BEYOND, beyond
 from emb_bench.batch.row import Row, unit_of
-from emb_bench.batch.summary import CHANGES_WITH, Campaign, condition_of, counting, is_usable, measured, shown_as
+from emb_bench.batch.summary import CHANGES_WITH, Campaign, columns_of, condition_of, counting, is_usable, shown_as
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.figures import COLOURS, DASHED, drawn
 
@@ -33,12 +33,12 @@ def draw_chart(rows: Sequence[Row], c: Campaign, path: Path) -> bool:
     size = (max(6.5, 0.8 + 3.4 * len(shown)), 0.8 + 1.7 * len(used))
     with drawn(path, len(used), len(shown), title, size, sharex="col", sharey="row") as axes:
         for name, line in zip(used, axes, strict=True):
-            values, deviations = measured(used[name], name)
+            of = columns_of(used[name], name)
             for key, axis in zip(shown, line, strict=True):
                 (known, at), found = condition_of(used[name], key, begun), over[name].get(key)
                 unit_size = shown_as(key, c.span)[2]
                 slope = found.slope * unit_size if found is not None and found.significant else None
-                _draw(axis, name, np.array(at) / unit_size, values, deviations, known, slope)
+                _draw(axis, name, np.array(at) / unit_size, of["estimate"], of["between_runs"], known, slope)
         for key, axis in zip(shown, axes[-1], strict=True):
             label, unit, _ = shown_as(key, c.span)
             axis.locator_params(axis="x", nbins=5)

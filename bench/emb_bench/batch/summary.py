@@ -144,18 +144,12 @@ def is_usable(row: Row, name: str) -> bool:
     return bool(row.get("fits") and row[f"{name}_identified"]) and deviation is not None and 0.0 < deviation < math.inf
 
 
-def _columns(used: Sequence[Row], name: str) -> dict[str, NDArray[np.float64]]:
+def columns_of(used: Sequence[Row], name: str) -> dict[str, NDArray[np.float64]]:
     """Columns of a parameter, by name; the deviation between runs in SI units."""
     found = {key: np.array([row.get(f"{name}_{key}") for row in used], np.float64) for key in OF_AN_ESTIMATE}
     if PARAMETERS[name].relative:  # shares are of one number, so that what came out small weighs no more
         found["between_runs"] *= abs(float(np.median(found["estimate"])))
     return found
-
-
-def measured(used: Sequence[Row], name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Estimates of a parameter and their deviations between runs, SI units."""
-    found = _columns(used, name)
-    return found["estimate"], found["between_runs"]
 
 
 def shown_as(key: str, span: float) -> tuple[str, str, float]:
@@ -180,7 +174,7 @@ def condition_of(used: Sequence[Row], key: str, begun: int) -> tuple[list[int], 
 def _estimates(used: Sequence[Row], name: str) -> ParameterEstimates | None:
     if not used:
         return None
-    found = _columns(used, name)
+    found = columns_of(used, name)
     values, deviations = found["estimate"], found["between_runs"].tolist()
     over = {}
     for key in CHANGES_WITH:

@@ -144,17 +144,14 @@ def identified(log: RunLog, asked: ExportOptions, estimate: Callable[[], Study])
 def _check(study: Study) -> None:
     from emb_bench.analysis.study import verdict
 
-    found = verdict(study)
+    found, why = verdict(study), f"not identified: {', '.join(study.unidentified)}"
+    remedy = "--params names those that are estimated"
     if not found.holds:
-        raise CheckFailedError(
-            f"{', '.join(study.names)}: the model '{study.estimate.plant.name}' {found.standing}, so that nothing is "
-            "written: emb-replay estimate says why; --nuisance or --model changes the model, --theta gives parameters"
-        )
-    if study.unidentified:
-        raise CheckFailedError(
-            f"{', '.join(study.names)}: not identified: {', '.join(study.unidentified)}, so that nothing is written: "
-            "--params names those that are estimated, --theta gives parameters"
-        )
+        why = f"the model '{study.estimate.plant.name}' {found.standing}"
+        remedy = "emb-replay estimate says why; --nuisance or --model changes the model"
+    if study.unidentified or not found.holds:
+        names = ", ".join(study.names)
+        raise CheckFailedError(f"{names}: {why}, so that nothing is written: {remedy}, --theta gives parameters")
 
 
 def drawn(e: Estimate, seed: int) -> tuple[Floats, float]:

@@ -21,7 +21,7 @@ from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.cli import gateway as cli
 from emb_runtime.config.bench import parse_bench
 from emb_runtime.drives.gateway import LISTEN, MOST_FRAMES, Gateway
-from emb_runtime.drives.mapping_file import load_mapping, parse_mapping
+from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.drives.node import INTRUDED, READY_SAMPLES, DriveNode
 from emb_runtime.drives.phases import ARMED_PERIODS, LONGEST_STOP_PERIODS, Active, Failed, Off, Ready, Stopping
 from emb_runtime.errors import BusError, SafetyStopError
@@ -67,35 +67,16 @@ class Bus:
         pass
 
 
-CONDITIONS = (
-    """
-temperature = {signal = "Temperature.Motor", unit = "degC", range = [-50, 400]}
-supply_voltage = {signal = "Supply.Voltage", unit = "mV", range = [0, 100000]}
-[can.protection]""",
-    """
-BO_ 21 Temperature: 8 Axis0
- SG_ Motor : 32|32@1- (1,0) [0|0] "degC" Host
-BO_ 23 Supply: 8 Axis0
- SG_ Voltage : 0|32@1- (1,0) [0|0] "mV" Host
-SIG_VALTYPE_ 21 Motor : 1;
-SIG_VALTYPE_ 23 Voltage : 1;
-""",
-)
-"""Conditions of an ODrive in its mapping file, and in its DBC."""
-
-
 class Played:
     """A gateway of an ODrive that obeys its arming and disarming, and the host."""
 
-    def __init__(self, largest: float = 6.0, conditions: bool = False) -> None:
+    def __init__(self, largest: float = 6.0) -> None:
         self.clock = SteppedClock(1_000 * MS)
         self.drive, self.host = Bus(), Bus()
-        bench = parse_bench(late_bench(), "bench.toml")
-        toml, dbc = ((EXAMPLES / f"odrive.{kind}").read_text() for kind in ("toml", "dbc"))
-        signals, messages = CONDITIONS if conditions else ("[can.protection]", "")
-        mapping = parse_mapping(toml.replace("[can.protection]", signals), dbc + messages, "odrive.toml")
+        mapping, bench = load_mapping(EXAMPLES / "odrive.toml"), parse_bench(late_bench(), "bench.toml")
         bound = largest * 0.0217 + 1e-4
-        mapping = replace(mapping, command=replace(mapping.command, low=-bound, high=bound))
+        told = {name: replace(one, high=1000.0) for name, one in mapping.conditions.items()}  # what emb.dbc cannot say
+        mapping = replace(mapping, command=replace(mapping.command, low=-bound, high=bound), conditions=told)
         self.waits: list[int] = []
         self.gateway = Gateway(mapping, bench, self.drive, self.host, self.clock, self.waits.append)
         self.node = self.gateway.node
@@ -391,17 +372,16 @@ def test_the_counts_go_to_the_host_with_each_status(played: Played) -> None:
         ([61.5], [], []),
         ([], [12.5], []),
         ([math.nan], [12.5], []),
+        ([310.0], [12.5], []),  # no value of emb.dbc
         ([61.5, math.nan, 1e9], [12.5, -1.0], [(61.5, 12.5)]),  # what the mapping does not believe is passed over
-        ([310.0], [12.5], []),  # believed, but no value of emb.dbc
     ],
 )
 def test_conditions_go_to_the_host_with_a_status_once_both_have_come(
-    temperatures: list[float], voltages: list[float], told: list[tuple[float, float]]
+    temperatures: list[float], voltages: list[float], told: list[tuple[float, float]], played: Played
 ) -> None:
-    played = Played(conditions=True)
     sent = [f for _ in range(250) for f in played.period()]
     played.drive.waiting += [Frame(0x015, struct.pack("<ff", 0.0, value)) for value in temperatures]
-    played.drive.waiting += [Frame(0x017, struct.pack("<ff", value * 1e3, 0.0)) for value in voltages]
+    played.drive.waiting += [Frame(0x017, struct.pack("<ff", value, 0.0)) for value in voltages]
     sent += [f for _ in range(200) for f in played.period()]
     shown = [LAYOUT.conditions.decode(f) for f in sent if f.identifier == LAYOUT.conditions.identifier]
     assert [(row["Temperature"], row["SupplyVoltage"]) for row in shown] == told  # in whole steps
