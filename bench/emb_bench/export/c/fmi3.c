@@ -114,30 +114,29 @@ FMI(fmi3FreeFMUState)(instance *c, void **kept) { return free(*kept), *kept = NU
 /* What this FMU has no use for. */
 typedef const uint8_t *binary;
 #define KEYS const reference v[], size_t n
-#define NONE(name, ...) \
-  FMI(fmi3##name)(instance *c, __VA_ARGS__) { return refuse(c, "fmi3" #name ": this FMU does not have it"); }
+#define REFUSED(name) { return refuse(c, "fmi3" #name ": this FMU does not have it"); }
+#define NONE(name, ...) FMI(fmi3##name)(instance *c, __VA_ARGS__) REFUSED(name)
+#define NO_MODE(name) FMI(fmi3##name)(instance *c) REFUSED(name)
 #define NO_TYPE(name, type) NONE(Get##name, KEYS, type x[], size_t m) NONE(Set##name, KEYS, const type x[], size_t m)
 #define NO_STATES(name) NONE(name, double x[], size_t n)
 #define NO_DERIVATIVE(name) \
   NONE(name, KEYS, const reference k[], size_t m, const double seed[], size_t seeds, double x[], size_t xs)
-#define NO_MODE(name) \
-  FMI(fmi3##name)(instance *c) { return refuse(c, "fmi3" #name ": this FMU does not have it"); }
+NO_TYPE(Float32, float) NO_TYPE(UInt16, uint16_t) NO_TYPE(UInt32, uint32_t) NO_TYPE(UInt64, uint64_t)
+NO_TYPE(UInt8, uint8_t) NO_TYPE(Int16, int16_t) NO_TYPE(Int32, int32_t) NO_TYPE(Int64, int64_t) NO_TYPE(Boolean, _Bool)
+NO_TYPE(Int8, int8_t) NO_TYPE(String, text) NO_MODE(EnterContinuousTimeMode) NO_MODE(EnterConfigurationMode)
+NO_MODE(EvaluateDiscreteStates) NO_MODE(ExitConfigurationMode) NO_MODE(EnterEventMode) NO_MODE(EnterStepMode)
+NO_STATES(GetEventIndicators) NO_STATES(GetContinuousStateDerivatives) NO_STATES(GetNominalsOfContinuousStates)
+NO_STATES(GetContinuousStates) NO_DERIVATIVE(GetDirectionalDerivative) NO_DERIVATIVE(GetAdjointDerivative)
 NONE(GetVariableDependencies, reference v, size_t a[], reference b[], size_t d[], int e[], size_t n)
-NONE(UpdateDiscreteStates, _Bool *d, _Bool *e, _Bool *f, _Bool *g, _Bool *h, double *time) NO_STATES(GetEventIndicators)
+NONE(UpdateDiscreteStates, _Bool *d, _Bool *e, _Bool *f, _Bool *g, _Bool *h, double *time) NONE(SetTime, double time)
 NONE(GetOutputDerivatives, KEYS, const int32_t o[], double x[], size_t m) NONE(SetShiftDecimal, KEYS, const double x[])
 NONE(SetBinary, KEYS, const size_t sizes[], const binary x[], size_t m) NONE(SetIntervalDecimal, KEYS, const double x[])
 NONE(SetIntervalFraction, KEYS, const uint64_t x[], const uint64_t y[]) NONE(GetNumberOfContinuousStates, size_t *n)
 NONE(DeserializeFMUState, const uint8_t x[], size_t size, void **kept) NONE(GetNumberOfEventIndicators, size_t *n)
 NONE(GetIntervalFraction, KEYS, uint64_t x[], uint64_t y[], int z[]) NONE(GetIntervalDecimal, KEYS, double x[], int y[])
-NONE(SetShiftFraction, KEYS, const uint64_t x[], const uint64_t y[]) NO_STATES(GetContinuousStateDerivatives)
+NONE(SetShiftFraction, KEYS, const uint64_t x[], const uint64_t y[]) NONE(GetShiftDecimal, KEYS, double x[])
 NONE(GetNumberOfVariableDependencies, reference v, size_t *n) NONE(CompletedIntegratorStep, _Bool d, _Bool *e, _Bool *f)
 NONE(SerializeFMUState, void *kept, uint8_t x[], size_t size) NONE(ActivateModelPartition, reference clock, double time)
 NONE(GetBinary, KEYS, size_t sizes[], binary x[], size_t m) NONE(GetShiftFraction, KEYS, uint64_t x[], uint64_t y[])
 NONE(SerializedFMUStateSize, void *kept, size_t *size) NONE(SetContinuousStates, const double x[], size_t n)
-NO_STATES(GetNominalsOfContinuousStates) NONE(GetShiftDecimal, KEYS, double x[]) NO_DERIVATIVE(GetDirectionalDerivative)
-NONE(SetClock, KEYS, const _Bool x[]) NO_DERIVATIVE(GetAdjointDerivative) NO_MODE(EnterContinuousTimeMode)
-NONE(GetClock, KEYS, _Bool x[]) NO_MODE(EnterConfigurationMode) NO_MODE(EvaluateDiscreteStates) NO_TYPE(Float32, float)
-NO_STATES(GetContinuousStates) NO_MODE(ExitConfigurationMode) NONE(SetTime, double time) NO_TYPE(UInt16, uint16_t)
-NO_TYPE(UInt32, uint32_t) NO_TYPE(UInt64, uint64_t) NO_TYPE(UInt8, uint8_t) NO_TYPE(Int16, int16_t)
-NO_TYPE(Int32, int32_t) NO_TYPE(Int64, int64_t) NO_TYPE(Boolean, _Bool) NO_MODE(EnterEventMode) NO_MODE(EnterStepMode)
-NO_TYPE(Int8, int8_t) NO_TYPE(String, text)
+NONE(SetClock, KEYS, const _Bool x[]) NONE(GetClock, KEYS, _Bool x[])
