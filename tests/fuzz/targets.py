@@ -99,7 +99,8 @@ def guard(draw: Random) -> Played:
         failing.append(fails)
         before = len(bus)
         with suppress(GuardRejectedError, BusError):
-            watched.send(watched.check(frame, state, now_ns - age_ns, now_ns))
+            watched.check(frame, state, now_ns - age_ns, now_ns)
+            watched.send(frame)
         failing.clear()
         legal = model.judge(frame, state, now_ns - age_ns, now_ns, fails)
         demand((len(bus) > before) == (legal and not fails), frame, state.name, age_ns, "legal:", legal, model)

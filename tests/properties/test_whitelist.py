@@ -31,6 +31,11 @@ def every(kind: str, valid: dict[int, bytes]) -> Iterator[Frame]:
             yield KINDS[kind]._replace(identifier=identifier, data=payload[:length])
 
 
+def let_out(guard: Guard, frame: Frame) -> None:
+    guard.check(frame, RunState.ACTIVE, 0, 0)
+    guard.send(frame)
+
+
 @pytest.fixture(scope="module")
 def valid(layout: Layout) -> dict[int, bytes]:
     frames = [
@@ -85,7 +90,7 @@ def test_no_frame_of_can_fd_is_believed_or_let_out(
         frame = Frame(identifier, valid.get(identifier, b"").ljust(length, b"\0"))
         assert reception.take(frame) is None
         with pytest.raises(GuardRejectedError):
-            guard.send(guard.check(frame, RunState.ACTIVE, 0, 0))
+            let_out(guard, frame)
     assert [w.valid_ns for w in reception.states] == fresh
     assert (reception.rejected, reception.foreign_command, bus) == (3, True, [])
 
@@ -107,7 +112,7 @@ def test_no_29_bit_identifier_that_ends_like_one_of_ours_is_taken_for_it(
         reception.take(frame)
         if identifier == COMMAND:
             try:
-                guard.send(guard.check(frame, RunState.ACTIVE, 0, 0))
+                let_out(guard, frame)
             except GuardRejectedError:
                 refused += 1
     assert [w.valid_ns for w in reception.states] == fresh
@@ -124,7 +129,7 @@ def test_the_guard_lets_out_exactly_one_identifier_of_one_length_and_kind(
     refused = 0
     for frame in every(kind, valid):
         try:
-            guard.send(guard.check(frame, RunState.ACTIVE, 0, 0))
+            let_out(guard, frame)
         except GuardRejectedError:
             refused += 1
     assert [(frame.identifier, len(frame.data)) for frame in bus] == ([(COMMAND, 5)] if kind == "standard" else [])

@@ -32,7 +32,6 @@ class Codec(NamedTuple):
     """Functions of one message."""
 
     encode: Callable[..., Frame]  # Record's fields → protected frame; raises FrameError
-    write: Callable[..., tuple[Frame, Any]]  # The same, with the record that a receiver reads
     decode: Callable[[Frame], Any]  # Frame → record; raises FrameRejectedError
 
 
@@ -54,7 +53,7 @@ def generate_codec(message: Message, record: type[Any], fields: tuple[Field, ...
         **{f"choices_{c.name}": c.field.choices for c in coded},
     }
     exec(_encoder(message, coded) + _decoder(message, coded), known)
-    return Codec(known["encode"], known["write"], known["decode"])
+    return Codec(known["encode"], known["decode"])
 
 
 class _Coded(NamedTuple):
@@ -106,39 +105,31 @@ def _encoder(message: Message, coded: list[_Coded]) -> str:
     values = ", ".join(c.name if c.field.fixed is None else str(c.field.fixed) for c in coded)
     checks = " and ".join(check for c in coded if (check := c.check()))
     word = " | ".join(f"({c.encoded()} & {c.signal.mask}) << {c.signal.shift}" for c in coded)
-    encoding = f"""({names}):
+    return f"""def encode({names}):
     if not ({checks}):
         raise refusal(({values},))
     w = {word}
     b = w.to_bytes({message.length}, "little")
-    f = new(Frame, ({message.identifier}, bytes(({_crc(message, "b")},)) + b[1:], 0, False, False, False, False, 0))
+    return new(Frame, ({message.identifier}, bytes(({_crc(message, "b")},)) + b[1:], 0, False, False, False, False, 0))
 """
-    reading = f"{_raws(coded, 1)}    return f, {_record(coded)}\n"
-    return f"def encode{encoding}    return f\n\ndef write{encoding}{reading}"
 
 
 def _decoder(message: Message, coded: list[_Coded]) -> str:
     kind = f"f.identifier == {message.identifier} and not (f.extended or f.remote or f.error)"
+    raws = "".join(f"            {c.name} = {c.raw()}\n" for c in coded)
     ranges = " and ".join(f"{c.signal.raw_minimum} <= {c.name} <= {c.signal.raw_maximum}" for c in coded)
+    values = ", ".join(c.decoded() for c in coded)
     return f"""
 def decode(f):
     b = f.data
     if {kind} and len(b) == {message.length}:
         w = word_of(b, "little")
         if b[0] == {_crc(message, "b")} and w & 0xF00 != 0xF00 and not w & {message.reserved}:
-{_raws(coded, 3)}            if {ranges}:
-                return {_record(coded)}
+{raws}            if {ranges}:
+                return new(Record, ({values},))
     explain(f)
     raise FrameError(f"{message.name}: the two decoders disagree on {{f}}")
 """
-
-
-def _raws(coded: list[_Coded], depth: int) -> str:
-    return "".join(f"{'    ' * depth}{c.name} = {c.raw()}\n" for c in coded)
-
-
-def _record(coded: list[_Coded]) -> str:
-    return f"new(Record, ({', '.join(c.decoded() for c in coded)},))"
 
 
 def _crc(message: Message, payload: str) -> str:

@@ -115,7 +115,7 @@ class Layout:
     charge: Message  # A node may send it
     gateway: Message  # A gateway sends it
     conditions: Message  # A node may send it
-    write_command: Callable[[int, int, float, bool], tuple[Frame, CurrentCommand]]  # With the command as it is read
+    encode_command: Callable[[int, int, float, bool], Frame]
     encode_angle: Callable[[int, float, int], Frame]
     encode_velocity: Callable[[int, float, float, NodeState, int], Frame]
     encode_status: Callable[[int, NodeState, StopReason, int, int], Frame]  # The version is the layout's
@@ -126,10 +126,6 @@ class Layout:
     decode_angle: Callable[[Frame], AngleFrame]
     decode_velocity: Callable[[Frame], VelocityFrame]
     decode_status: Callable[[Frame], StatusFrame]
-
-    def encode_command(self, counter: int, answers: int, current: float, enable: bool) -> Frame:
-        """The frame of a command."""
-        return self.write_command(counter, answers, current, enable)[0]
 
     @property
     def messages(self) -> dict[str, Message]:
@@ -172,6 +168,5 @@ def load_layout() -> Layout:
     messages = [describe(database.get_message_by_name(name)) for name in fields]
     codecs = [generate_codec(message, *fields[message.name]) for message in messages]
     # In the order of the layout's fields.
-    encoders = [codecs[0].write, *(codec.encode for codec in codecs[1:])]
-    parts: list[Any] = [*messages, *encoders, *(codec.decode for codec in codecs[:4])]
+    parts: list[Any] = [*messages, *(codec.encode for codec in codecs), *(codec.decode for codec in codecs[:4])]
     return Layout(text, version, *parts)

@@ -156,10 +156,10 @@ class Core:
             memory.unanswered(sample, memory.missed, now_ns, left)
             self._end_cycle(sample)
             return None
-        write, counter = self.setup.layout.write_command, self.guard.next_counter
-        frame, command = write(counter, sample.counter, decision.current, True)
-        memory.decided(decision, command)
-        return self.guard.check(frame, self.state, sample.receive_time_ns, now_ns)
+        encode, guard = self.setup.layout.encode_command, self.guard
+        frame = encode(guard.next_counter, sample.counter, decision.current, True)
+        memory.decided(decision, guard.check(frame, self.state, sample.receive_time_ns, now_ns))
+        return frame
 
     def sent(self, now_ns: int, lost: str = "") -> None:
         """Record the cycle of a command that was handed to the bus at a monotonic time [ns].
@@ -208,7 +208,8 @@ class Core:
         """
         self._record_call(Call.STOP_FRAME, now_ns)
         frame = self.setup.layout.encode_command(self.guard.next_counter, self.newest_counter, 0.0, False)
-        return self.guard.check(frame, self.state, now_ns, now_ns)
+        self.guard.check(frame, self.state, now_ns, now_ns)
+        return frame
 
     def end(self, now_ns: int) -> None:
         """Check how the node came to rest; the run is over."""

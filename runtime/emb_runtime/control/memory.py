@@ -165,7 +165,7 @@ class Memory:
             self._remember(0.0)
 
     def decided(self, decision: Decision, command: CurrentCommand) -> None:
-        """Store a decision on the newest sample, and the command made of it."""
+        """Store a decision on the newest sample, and the command that the guard has read in its frame."""
         self._decision, self._command = decision, command
 
     def answered(self, decide_ns: int, send_ns: int) -> None:

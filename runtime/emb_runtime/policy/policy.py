@@ -128,11 +128,8 @@ class Policy:
         beyond the contract a current that is so many times beyond its limit. PolicyRefusedError if ONNX Runtime could
         not evaluate the graph.
         """
-        inputs = self._inference.inputs
-        inputs[0], inputs[1], inputs[2] = angle, velocity, step * self._sample_time
-        if self._estimates:
-            for i, number in enumerate(estimator.parameters):
-                inputs[len(SAMPLE) + i] = number
+        numbers = estimator.parameters if self._estimates else ()
+        self._inference.inputs[:] = array(CODE, (angle, velocity, step * self._sample_time, *numbers))
         self._inference.run()
         output = self._inference.outputs[0]
         if self._kind == "current":
@@ -185,7 +182,7 @@ def _difference(inference: Inference, contract: Contract) -> str:
     """
     largest = min(contract.greatest, CEILING_CURRENT if contract.kind == "current" else CEILING_VELOCITY)
     for index, vector in enumerate(contract.vectors):
-        inference.inputs[:] = type(inference.inputs)(inference.inputs.typecode, vector.inputs)
+        inference.inputs[:] = array(CODE, vector.inputs)
         inference.run()
         wanted, got = vector.outputs[0], inference.outputs[0]
         if not abs(wanted - got) <= VECTOR_TOLERANCE * largest:  # this way round, NaN differs

@@ -79,8 +79,8 @@ class Guard:
         """Returns True if one more command now, monotonic [ns], would be more than the bench's rate allows."""
         return len(self._times) == self._most and now_ns - self._times[0] < RATE_WINDOW_PERIODS * self._period_ns
 
-    def check(self, frame: Frame, state: RunState, sample_time_ns: int, now_ns: int) -> Frame:
-        """Check a command frame; gives the frame that :meth:`send` may put on the bus.
+    def check(self, frame: Frame, state: RunState, sample_time_ns: int, now_ns: int) -> CurrentCommand:
+        """Check a command frame, which :meth:`send` may then put on the bus; gives the command that it says.
 
         Args:
             frame: the frame.
@@ -105,7 +105,7 @@ class Guard:
         self._times.append(now_ns)
         self._pulse.publish(command.counter, command.answers)
         self._allowed = frame  # last: a check that fails on its way allows nothing
-        return frame
+        return command
 
     def send(self, frame: Frame) -> None:
         """Put the frame that was checked last on the bus, once.

@@ -52,7 +52,13 @@ def command(current: float = 1.0, counter: int = 0, enable: bool = True) -> Fram
 
 
 def let_out(guard: Guard, frame: Frame, state: RunState, sample_ns: int, now_ns: int) -> None:
-    guard.send(guard.check(frame, state, sample_ns, now_ns))
+    assert guard.check(frame, state, sample_ns, now_ns) == load_layout().decode_command(frame)
+    guard.send(frame)
+
+
+def let_check(guard: Guard, frame: Frame) -> Frame:
+    guard.check(frame, ACTIVE, 100 * MS, 100 * MS)
+    return frame
 
 
 def refused(guard: Guard, bus: Bus, frame: Frame, reason: str, state: RunState = ACTIVE, age_ns: int = 0) -> None:
@@ -80,17 +86,16 @@ def test_only_the_frame_that_was_checked_last_leaves_and_only_once(guard: Guard,
         assert (guard.passed, guard.rejected, len(bus.frames)) == (passed, rejected + 1, passed)
 
     is_refused(command())
-    first = guard.check(command(), ACTIVE, 100 * MS, 100 * MS)
+    first = let_check(guard, command())
     is_refused(command())  # the same bytes, and not checked
     is_refused(first)  # another one was tried
-    second = guard.check(command(counter=1), ACTIVE, 100 * MS, 100 * MS)
+    second = let_check(guard, command(counter=1))
     guard.send(second)
     is_refused(second)
-    older = guard.check(command(counter=2), ACTIVE, 100 * MS, 100 * MS)
-    newer = guard.check(command(counter=3), ACTIVE, 100 * MS, 100 * MS)
+    older, newer = let_check(guard, command(counter=2)), let_check(guard, command(counter=3))
     guard.send(newer)
     is_refused(older)
-    overtaken = guard.check(command(counter=4), ACTIVE, 100 * MS, 100 * MS)
+    overtaken = let_check(guard, command(counter=4))
     refused(guard, bus, command(counter=4), "does not follow")
     is_refused(overtaken)
     assert bus.frames == [second, newer]
@@ -136,8 +141,8 @@ def test_no_bench_no_limit_and_no_dbc_reaches_beyond_the_ceiling_of_six_ampere(b
     current = command.signal("Current")
     wider = replace(current, minimum=-6.5, maximum=6.5, raw_minimum=-32_500, raw_maximum=32_500)
     command = replace(command, signals=tuple(wider if s is current else s for s in command.signals))
-    write = generate_codec(command, *_fields(1)["EMB_Command"]).write
-    wide = replace(load_layout(), command=command, write_command=write)
+    encode = generate_codec(command, *_fields(1)["EMB_Command"]).encode
+    wide = replace(load_layout(), command=command, encode_command=encode)
     guard = Guard(wide, replace(bench, limits=replace(bench.limits, current=6.5)), bus.send, limit=6.5)
     refused(guard, bus, wide.encode_command(0, 0, 6.0002, True), "beyond 6 A")
     let_out(guard, wide.encode_command(0, 0, 6.0, True), ACTIVE, 100 * MS, 100 * MS)
