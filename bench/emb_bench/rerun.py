@@ -10,7 +10,6 @@ import contextlib
 from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from itertools import islice
 from operator import itemgetter
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
@@ -18,7 +17,6 @@ import msgspec
 
 from emb_bench.logs.estimates import by_step
 from emb_bench.logs.log import RunLog, require_driven
-from emb_runtime.can.e2e import COUNTER_MODULUS
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.config.bench import CEILING_CURRENT
 from emb_runtime.control.actor import Actor, Still, homing_steps
@@ -46,7 +44,7 @@ ANSWER = Call.ANSWER.name
 CALLS = {call.value: call.name for call in Call}
 OF_THE_BUS = Fault.BUS_LOST.name, Fault.WATCHDOG_TRIPPED.name  # Faults that keep a command back
 OF_THE_DRIVER = (*OF_THE_BUS, Fault.INTERNAL.name)  # Faults that may come while it sends an answer
-AFTER_STOP_FRAME = Call.STOP_FRAME, Call.END
+DUE = Call.ANSWER.value, Call.LATCH.value  # Calls of which one may have to come next
 
 
 class Difference(NamedTuple):
@@ -190,14 +188,16 @@ class Playback:
         self.differences: list[Difference] = []  # In the order in which they came
         self._estimates = by_step(log)
         self._due, self._came = tuple[str, ...](), ""  # inputs of which one comes next, and what the core has done
-        self._lost = ""  # why the bus has no room for the next frame
         self._sent = deque[tuple[int | None, Frame, bool]]()  # not found on the bus yet: step, frame, it was there
         self._step: int | None = None
 
     def send(self, frame: Frame) -> None:
-        """Bus of the rerun: takes a frame, or has no room for it, as recorded."""
-        if self._lost:
-            raise TransmitQueueFullError(self._lost)
+        """Bus of the rerun: takes a frame, or has no room for it, as recorded with the call in hand."""
+        call = self.items[0]
+        assert isinstance(call, InputRecord)
+        if call.text:
+            raise TransmitQueueFullError(call.text)
+        self._sent.append((self._step, frame, call.send_time_ns > 0 or call.call == Call.STOP_FRAME))
 
     def play(self, core: Core) -> None:
         """Play all that was recorded, or until the core leaves it."""
@@ -211,14 +211,15 @@ class Playback:
                 for step, numbers in self._estimates.items():
                     self._check(step, "estimate", numbers, None)
                 if core.fault is not Fault.BUS_LOST:  # else the last may have been lost
-                    self._miss_sent(len(self._sent))
+                    self._find_sent(None)
 
     # --- what goes in -----------------------------------------------------------------------------------------------
 
     def _give(self, core: Core, item: Item) -> None:
         """Give an input to the core: the next item must be one, and one that is due."""
-        name = _name(item)
-        if name not in self._due if self._due else name in (ANSWER, None):
+        name = _name(item) if isinstance(item, InputRecord) and item.call in DUE else ""
+        is_input = isinstance(item, InputRecord | FrameRecord)
+        if name not in self._due if self._due else name == ANSWER or not is_input:
             raise self._diverged(item, self._came or "nothing")
         self._due, self._came = (), ""
         try:
@@ -254,44 +255,33 @@ class Playback:
         time_ns, call, _, code, text = item
         match call:
             case Call.ANSWER:
-                self._answer(core, core.answer(time_ns), item)
+                if (frame := core.answer(time_ns)) is not None:
+                    self._answer(core, frame, item)
             case Call.LATCH:
                 core.latch(Fault[code], time_ns)
             case Call.EXPLAIN:
                 core.explain(Fault[code], time_ns, text)
             case Call.NOTE:
                 core.note(time_ns, code, text)
+                if code == STOP_FRAME_NOT_SENT and self._sent:
+                    self._sent.append((*self._sent.pop()[:2], False))
             case Call.STOP_FRAME:
                 with contextlib.suppress(GuardRejectedError):
-                    frame = core.stop_frame(time_ns)
-                    core.guard.send(frame)
-                    self._sent.append((self._step, frame, self._is_stop_frame_sent()))
+                    core.guard.send(core.stop_frame(time_ns))
             case _:
                 {Call.BEGIN: core.begin, Call.TIMEOUT: core.timeout, Call.END: core.end}[Call(call)](time_ns)
 
-    def _answer(self, core: Core, frame: Frame | None, item: InputRecord) -> None:
+    def _answer(self, core: Core, frame: Frame, item: InputRecord) -> None:
         """Send or lose the frame of an answer as it was; where neither was recorded a fault came between."""
-        if frame is None:
-            return
-        self._lost = item.text
         try:
             core.guard.send(frame)
-        except TransmitQueueFullError:
-            self._lost = ""
-            core.sent(item.time_ns, item.text)
-            return
-        self._sent.append((self._step, frame, item.send_time_ns > 0))
-        if item.send_time_ns:
-            core.sent(item.send_time_ns)
+        except TransmitQueueFullError as err:
+            core.sent(item.time_ns, str(err))
         else:
-            self._due, self._came = OF_THE_DRIVER, f"the record of step {self._step}"
-
-    def _is_stop_frame_sent(self) -> bool:
-        """Returns False if the log says that the stop frame in hand was not sent: it does so before the next one."""
-        for item in islice(self.items, 1, None):
-            if isinstance(item, InputRecord) and (item.code == STOP_FRAME_NOT_SENT or item.call in AFTER_STOP_FRAME):
-                return item.code != STOP_FRAME_NOT_SENT
-        return True
+            if item.send_time_ns:
+                core.sent(item.send_time_ns)
+            else:
+                self._due, self._came = OF_THE_DRIVER, f"the record of step {self._step}"
 
     # --- what comes out ---------------------------------------------------------------------------------------------
 
@@ -304,39 +294,30 @@ class Playback:
         if not self.items:
             self.ended = False
             return
-        match self.items.popleft(), came:
-            case CycleRecord() as item, CycleRecord() as record:
-                self.counts[CycleRecord] += 1
-                for name, recorded, value in zip(item._fields, item, record, strict=True):
-                    self._check(item.step, name, recorded, value)
-            case EventRecord() as item, EventRecord() as record if item.code == record.code:
-                self.counts[EventRecord] += 1
-                self._check(self._step, f"time of {item.code}", item.time_ns, record.time_ns)
-                self._check(self._step, f"text of {item.code}", _cut(item.text), _cut(record.text))
-            case InputRecord() as item, InputRecord() as record:
-                self._check(self._step, f"sending of {CALLS.get(item.call)}", item.send_time_ns, record.send_time_ns)
-            case FrameRecord() as item, FrameRecord():
-                if item.frame.own:
-                    self._find_sent(item.frame)
-            case item, _:
-                raise self._diverged(item, _words(came))
+        item = self.items.popleft()
+        if isinstance(item, FrameRecord) and isinstance(came, FrameRecord):
+            if item.frame.own:
+                self._find_sent(item.frame)
+            return
+        if type(item) is not type(came) or getattr(item, "code", "") != getattr(came, "code", ""):
+            raise self._diverged(item, _words(came))
+        self.counts[type(came)] += 1
+        step, of = (item.step, "") if isinstance(item, CycleRecord) else (self._step, f" of {_name(item)}")
+        # As they get into a log, where the ring cuts long texts.
+        for name, recorded, value in zip(item._fields, unpack(*pack(item)), unpack(*pack(came)), strict=True):
+            self._check(step, name + of, recorded, value)
 
-    def _find_sent(self, echo: Frame) -> None:
-        """Find the sent frame whose echo was recorded; those before it were not on the bus."""
-        bare = echo._replace(time_ns=0, own=False, dropped=0)
-        waiting = [frame for _, frame, _ in islice(self._sent, COUNTER_MODULUS)]
-        if bare in waiting:
-            self._miss_sent(waiting.index(bare))
-            self.counts[FrameRecord] += 1
-        step, came, _ = self._sent.popleft() if self._sent else (self._step, None, True)
-        self._check(step, "sent frame", _hex(echo), _hex(came))
-
-    def _miss_sent(self, count: int) -> None:
-        """Compare sent frames of which no echo was recorded."""
-        for _ in range(count):
-            step, frame, left = self._sent.popleft()
-            if left:
+    def _find_sent(self, echo: Frame | None) -> None:
+        """Find the sent frame whose echo was recorded, None at the end: those before it were not on the bus."""
+        bare = echo and echo._replace(time_ns=0, own=False, dropped=0)
+        while self._sent:
+            step, frame, is_sent = self._sent.popleft()
+            if frame == bare:
+                self.counts[FrameRecord] += 1
+                return
+            if is_sent:
                 self._check(step, "sent frame", _hex(None), _hex(frame))
+        self._check(self._step, "sent frame", _hex(bare), _hex(None))
 
     def _check(self, step: int | None, what: str, recorded: object, came: object) -> None:
         """Compare to the last bit: NaN is NaN, and minus zero is not zero."""
@@ -348,22 +329,13 @@ class Playback:
         return DivergedError()
 
 
-def _name(item: Item) -> str | None:
-    """Name of an input that may be due, an answer or a fault; empty of another one, None of what is none."""
-    if not isinstance(item, InputRecord):
-        return "" if isinstance(item, FrameRecord) else None
-    return item.code if item.call == Call.LATCH else ANSWER if item.call == Call.ANSWER else ""
-
-
 def _hex(frame: Frame | None) -> str:
     return f"{frame.identifier:03x}#{frame.data.hex()}" if frame else "no such frame"
 
 
-def _cut(text: str) -> str:
-    """A text as it gets into a log: cut where the ring has no more room."""
-    record = unpack(*pack(EventRecord(0, "", text)))
-    assert isinstance(record, EventRecord)
-    return record.text
+def _name(record: Record) -> str:
+    """Code of a fault or an event, or name of an input."""
+    return getattr(record, "code", "") or CALLS.get(getattr(record, "call", -1), "an unknown call")
 
 
 def _words(record: Record) -> str:
@@ -371,6 +343,5 @@ def _words(record: Record) -> str:
         return f"frame {_hex(record.frame)}"
     if isinstance(record, CycleRecord):
         return f"the record of step {record.step}"
-    assert isinstance(record, InputRecord | EventRecord)  # the core makes no other
-    name = record.code or CALLS.get(getattr(record, "call", -1), "an unknown call")
-    return one_line(f"{name} ({record.text})" if record.text else name)
+    text = getattr(record, "text", "")
+    return one_line(f"{_name(record)} ({text})" if text else _name(record))

@@ -383,7 +383,7 @@ def test_an_event_with_another_text_or_time_is_reported(recorded: Callable[..., 
 
     for event in run.journal.events:
         result = again(run, alter=partial(change, event.code))
-        assert [d.what for d in result.differences] == [f"time of {event.code}", f"text of {event.code}"]
+        assert [d.what for d in result.differences] == [f"time_ns of {event.code}", f"text of {event.code}"]
         assert result.differences[1].recorded == result.differences[1].came + "." == event.text + "."
         assert result.followed
 
@@ -396,7 +396,7 @@ def test_an_answer_that_was_sent_at_another_time_is_reported(recorded: Callable[
         records[at] = record._replace(time_ns=record.time_ns + 3_000_000)  # so late that nothing is sent
 
     result = again(recorded(), alter=change)
-    assert (result.differences[0].step, result.differences[0].what) == (60, "sending of ANSWER")
+    assert (result.differences[0].step, result.differences[0].what) == (60, "send_time_ns of ANSWER")
 
 
 def test_a_sensor_frame_that_is_missing_or_other_is_reported(recorded: Callable[..., Driven], again: Again) -> None:
