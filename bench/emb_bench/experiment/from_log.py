@@ -203,7 +203,7 @@ def currents_by_charge(samples: Samples, bench: Bench, layout: Layout) -> Floats
     told = np.full(len(samples.angle), np.nan)
     if len(told) < 3:
         return told
-    signal, received = layout.charge.signal("Charge"), samples.received
+    signal, received = layout.optional[CHARGE].signal("Charge"), samples.received
     wrap = (signal.raw_maximum + 1) * signal.factor
     alone = np.flatnonzero(~received[1:-1] & received[2:] & received[:-2]) + 1
     passed = (samples.charge[alone + 1] - samples.charge[alone - 1] + 0.5 * wrap) % wrap - 0.5 * wrap

@@ -361,7 +361,7 @@ class RunLog:
         found, topic = dict[str, NDArray[np.float64]](), "/emb/EMB_Conditions"
         for name, (signal, _, _) in CONDITIONS.items():
             values = np.asarray(self.tables[topic].get(signal, ()), np.float64) if topic in self.topics else np.empty(0)
-            one = load_layout().conditions.signal(signal)
+            one = load_layout().optional["EMB_Conditions"].signal(signal)
             known = values[(values >= one.minimum) & (values <= one.maximum)]  # this way round, NaN is none
             if known.size:
                 found[name] = known

@@ -250,7 +250,7 @@ def _conditions(given: dict[str, Any], option: str) -> tuple[float, ...]:
     """Temperature [degC] and supply voltage [V], or nothing: one frame carries both."""
     told = {name: given.pop(name) for name in CONDITIONS if name in given}
     for name, text in told.items():
-        signal = load_layout().conditions.signal(CONDITIONS[name].signal)
+        signal = load_layout().optional["EMB_Conditions"].signal(CONDITIONS[name].signal)
         if not signal.minimum <= _number(text) <= signal.maximum:  # this way round, NaN is refused
             raise UsageError(f"{option}{name}: expected {signal.range_text}, got '{text}'")
     if len(told) == 1:

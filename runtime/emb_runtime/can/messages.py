@@ -7,7 +7,7 @@ saturates.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache
@@ -112,9 +112,7 @@ class Layout:
     angle: Message
     velocity: Message
     status: Message
-    charge: Message  # A node may send it
-    gateway: Message  # A gateway sends it
-    conditions: Message  # A node may send it
+    optional: Mapping[str, Message]  # By name: those that a node or a gateway may send
     encode_command: Callable[[int, int, float, bool], Frame]
     encode_angle: Callable[[int, float, int], Frame]
     encode_velocity: Callable[[int, float, float, NodeState, int], Frame]
@@ -135,7 +133,7 @@ class Layout:
     @property
     def known(self) -> tuple[Message, ...]:
         """All messages, those included that need not be sent."""
-        return (*self.messages.values(), self.charge, self.gateway, self.conditions)
+        return (*self.messages.values(), *self.optional.values())
 
     @property
     def device_time_period_ns(self) -> int:
@@ -167,6 +165,7 @@ def load_layout() -> Layout:
     fields = _fields(version)
     messages = [describe(database.get_message_by_name(name)) for name in fields]
     codecs = [generate_codec(message, *fields[message.name]) for message in messages]
+    optional = {message.name: message for message in messages[4:]}
     # In the order of the layout's fields.
-    parts: list[Any] = [*messages, *(codec.encode for codec in codecs), *(codec.decode for codec in codecs[:4])]
-    return Layout(text, version, *parts)
+    parts: list[Any] = [*messages[:4], optional, *(codec.encode for codec in codecs)]
+    return Layout(text, version, *parts, *(codec.decode for codec in codecs[:4]))

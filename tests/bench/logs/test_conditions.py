@@ -52,7 +52,9 @@ def test_they_go_from_the_bus_to_log_campaign_and_certificate(
     tmp_path: Path, simulate: Simulate, replay: Replay
 ) -> None:
     frames = [LAYOUT.encode_conditions(0, 41.0, 23.9), LAYOUT.encode_conditions(1, 42.0, 24.1)]
-    hostile = Frame(LAYOUT.conditions.identifier, protected(LAYOUT.conditions.identifier, BODY))
+    hostile = Frame(
+        LAYOUT.optional["EMB_Conditions"].identifier, protected(LAYOUT.optional["EMB_Conditions"].identifier, BODY)
+    )
     damaged = frames[0]._replace(data=bytes(6))
     run = simulate(square, options="plant=exact,seed=5", on_receive=told([*frames, hostile, damaged]))
     warm = write_log(tmp_path / "warm.mcap", run)
@@ -78,7 +80,7 @@ def test_a_simulated_node_sends_them_on_request_and_no_other_frame_changes(
         for n, more in enumerate(("", ",temperature=65,supply_voltage=12.8"))
     )
     frames = [[(f.identifier, f.data) for f in read_log(path).frames] for path in (plain, telling)]
-    own = LAYOUT.conditions.identifier
+    own = LAYOUT.optional["EMB_Conditions"].identifier
     assert [f for f in frames[1] if f[0] != own] == frames[0]
     periods = sum(f[0] == LAYOUT.angle.identifier for f in frames[1])
     assert sum(f[0] == own for f in frames[1]) == pytest.approx(periods / 100, abs=1.0)

@@ -356,8 +356,8 @@ def test_the_counts_go_to_the_host_with_each_status(played: Played) -> None:
     node = played.node
     node.outlet.not_sent, node.answers.braked, node.outlet.guard.rejected = 3, 70_000, 2
     assert run(played, 400) == ["ready"]
-    assert LAYOUT.gateway is not None
-    told = [LAYOUT.gateway.decode(f) for f in played.host.sent if f.identifier == LAYOUT.gateway.identifier]
+    own = LAYOUT.optional["EMB_Gateway"]
+    told = [own.decode(f) for f in played.host.sent if f.identifier == own.identifier]
     statuses = [f for f in played.host.sent if f.identifier == LAYOUT.status.identifier]
     assert len(told) == len(statuses) >= 3
     assert [values["Counter"] for values in told] == [(n + 1) % 15 for n in range(len(told))]
