@@ -32,6 +32,7 @@ LOG_RATE = 500_000  # Log rate of a run at 1 kHz, with room to spare: measured a
 
 BORDER = 1e-6  # Share of a range's end that counts as the end
 DONE = "done"  # Result of a run that was completed
+REFUSED = "REFUSED"  # Result of one that was refused, for what is no fault
 LOG_INCOMPLETE = "LOG_INCOMPLETE"  # Result of one that was completed and not recorded
 
 
@@ -103,50 +104,28 @@ class RunResult:
         }
 
 
-@dataclass(frozen=True)
-class Reading:
-    """Result of ``--read-only``."""
-
-    plan: Plan
-    statistics: BusStatistics
-    checks: tuple[Check, ...]
-    refused: RefusedError | None  # Why a run could not begin
-
-    @property
-    def exit_reason(self) -> str:
-        """``DONE``, ``REFUSED`` or the name of a fault."""
-        if self.refused is None:
-            return "DONE"
-        return "REFUSED" if self.refused.fault is None else self.refused.fault.name
-
-    def trailer(self) -> dict[str, str]:
-        """Trailer of its log."""
-        end = {"exit_reason": self.exit_reason, "detail": str(self.refused or ""), "heard": self.statistics.document()}
-        return log_entries(end | {"preflight": [check.document() for check in self.checks]})
-
-    def document(self, log: RecorderResult) -> dict[str, Any]:
-        """The reading as plain data."""
-        plan, refused = self.plan, self.refused
-        exit_code = refused.exit_code if refused else EXIT_DONE if log.complete else EXIT_LOG
-        result = result_document(refused.fault if refused else None, exit_code, str(refused or ""))
-        return {
-            **result,
-            "result": self.exit_reason if refused else DONE,
-            **plan.document(RunType.LISTEN_ONLY, 0),
-            "bench": plan.bench.name,
-            "heard": self.statistics.document(),
-            "preflight": [check.document() for check in self.checks],
-            **log_document(log),
-        }
+def reading(plan: Plan, statistics: BusStatistics, checks: Sequence[Check], refused: EmbError | None) -> dict[str, Any]:
+    """Result of ``--read-only`` as plain data, but for its log; with the error for which a run could not begin."""
+    return {
+        **_refusal(refused),
+        **plan.document(RunType.LISTEN_ONLY, 0),
+        "bench": plan.bench.name,
+        "heard": statistics.document(),
+        "preflight": [check.document() for check in checks],
+    }
 
 
 def refusal(err: EmbError, iface: str) -> dict[str, Any]:
     """A run that was refused before anything was sent, as plain data."""
-    refused = err if isinstance(err, RefusedError) else None
-    fault = Fault.BUS_LOST if isinstance(err, BusError) else refused.fault if refused else None
-    result = result_document(fault, err.exit_code, str(err)) | ({} if fault else {"result": "REFUSED"})
-    checks = [check.document() for check in refused.checks] if refused else []
-    return {**result, "iface": iface, "home": False, "log": None, "homing": {}, "preflight": checks}
+    checks = [check.document() for check in err.checks] if isinstance(err, RefusedError) else []
+    return {**_refusal(err), "iface": iface, "home": False, "log": None, "homing": {}, "preflight": checks}
+
+
+def _refusal(err: EmbError | None) -> dict[str, Any]:
+    """Result of what sent nothing, by its error."""
+    fault = Fault.BUS_LOST if isinstance(err, BusError) else err.fault if isinstance(err, RefusedError) else None
+    result = result_document(fault, err.exit_code if err else EXIT_DONE, str(err or ""))
+    return result | {"result": REFUSED} if err and not fault else result
 
 
 def result_document(fault: Fault | None, exit_code: int, detail: str) -> dict[str, Any]:

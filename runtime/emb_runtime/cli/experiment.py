@@ -8,7 +8,6 @@ from typing import Any
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import StopReason
 from emb_runtime.can.transport import Transport
-from emb_runtime.cli.bus_monitor import BusStatistics
 from emb_runtime.cli.documents import refusal
 from emb_runtime.cli.plan import Plan
 from emb_runtime.cli.session import Bus, Console, conduct, observe
@@ -42,51 +41,37 @@ def experiment(
     transport, clock = opened or open_transport(plan.iface, plan.bench, identifiers)
     bus = Bus(plan.iface, transport, clock)
     assert plan.experiment is not None
-    home = plan.experiment.home
+    home, homing = plan.experiment.home, dict[str, dict[str, Any]]()
     try:
-        homing: dict[str, Any] = {}
-        if home and _is_away(plan, _observe(plan, bus, console)):
-            way = conduct(plan, bus, RunType.HOMING, _beside(path, "before"), console)
-            homing["before"] = way.document()
-            if way.exit_code != EXIT_DONE:
-                return homing["before"], way.exit_code
+        if home and (exit_code := _go_home(plan, bus, path, console, homing, "before")) != EXIT_DONE:
+            return homing["before"], exit_code
         ran = conduct(plan, bus, RunType.EXPERIMENT, path, console)
         exit_code = ran.exit_code
         if home and may_go_home(ran.outcome) and not console.stop_requested():
-            way_code = _go_home(plan, bus, path, console, homing)
+            try:
+                way_code = _go_home(plan, bus, path, console, homing, "after")
+            except EmbError as err:  # the experiment counts, whatever fails here
+                homing["after"], way_code = refusal(err, bus.iface), err.exit_code
             exit_code = exit_code or way_code
     finally:
         transport.close()
     return ran.document() | {"homing": homing}, exit_code
 
 
-def _observe(plan: Plan, bus: Bus, console: Console) -> BusStatistics:
-    """Bus statistics now, wherever the brake is."""
-    return observe(plan, bus, plan.start_conditions(anywhere=True), console.stop_requested)
+def _go_home(plan: Plan, bus: Bus, path: Path, console: Console, homing: dict[str, dict[str, Any]], when: str) -> int:
+    """The way home before or after an experiment, if the brake is not at home; its document goes to ``homing``.
 
-
-def _is_away(plan: Plan, statistics: BusStatistics) -> bool:
-    """Returns True if the brake is not at home, or its place is unknown: the pre-flight of a way home says why."""
-    return statistics.sample is None or not Bounds(plan.bench).is_home(statistics.sample)
-
-
-def _go_home(plan: Plan, bus: Bus, path: Path, console: Console, homing: dict[str, Any]) -> int:
-    """The way home after an experiment, if one is needed; its exit code. Whatever fails here, the experiment counts."""
-    try:
-        statistics = _observe(plan, bus, console)
-        # The run may have ended before the node told why it stopped: the status is rarer than the samples.
-        if statistics.status is not None and statistics.status.stop_reason is StopReason.LIMIT:
-            return EXIT_SAFETY_STOP
-        if not _is_away(plan, statistics):
-            return EXIT_DONE
-        way = conduct(plan, bus, RunType.HOMING, _beside(path, "after"), console)
-    except EmbError as err:
-        homing["after"] = refusal(err, bus.iface)
-        return err.exit_code
-    homing["after"] = way.document()
+    Returns:
+        Its exit code.
+    """
+    statistics = observe(plan, bus, plan.start_conditions(anywhere=True), console.stop_requested)
+    sample, status = statistics.sample, statistics.status
+    # The run may have ended before the node told why it stopped: the status is rarer than the samples.
+    if when == "after" and status is not None and status.stop_reason is StopReason.LIMIT:
+        return EXIT_SAFETY_STOP
+    if sample is not None and Bounds(plan.bench).is_home(sample):  # without one the pre-flight says why
+        return EXIT_DONE
+    log = path.with_name(f"{path.stem}-{when}{HOMING_LOG}{path.suffix}")
+    way = conduct(plan, bus, RunType.HOMING, log, console)
+    homing[when] = way.document()
     return way.exit_code
-
-
-def _beside(path: Path, when: str) -> Path:
-    """The log of a way home."""
-    return path.with_name(f"{path.stem}-{when}{HOMING_LOG}{path.suffix}")

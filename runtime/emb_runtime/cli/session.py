@@ -15,15 +15,25 @@ from typing import Any
 from emb_runtime.can.messages import Layout
 from emb_runtime.can.transport import Transport
 from emb_runtime.cli.bus_monitor import BusMonitor, BusStatistics, is_alarming, listen
-from emb_runtime.cli.documents import Reading, RunResult, header, log_bytes, trailer
+from emb_runtime.cli.documents import (
+    DONE,
+    REFUSED,
+    RunResult,
+    header,
+    log_bytes,
+    log_document,
+    log_entries,
+    reading,
+    trailer,
+)
 from emb_runtime.cli.plan import Plan
-from emb_runtime.cli.preflight import Check, Findings, RefusedError, first_refusal, interrupted, run_checks
+from emb_runtime.cli.preflight import Check, Findings, first_refusal, interrupted, run_checks
 from emb_runtime.control.actor import Actor, Still, homing_steps
 from emb_runtime.control.core import Core
 from emb_runtime.control.loop import Loop
 from emb_runtime.control.setup import Setup
 from emb_runtime.control.start_conditions import StartConditions
-from emb_runtime.errors import BusError, LogError, UsageError
+from emb_runtime.errors import EXIT_DONE, EXIT_LOG, BusError, EmbError, LogError, UsageError
 from emb_runtime.log.recorder import Recorder
 from emb_runtime.log.ring_buffer import ClockRecord, EventRecord, FrameRecord
 from emb_runtime.records import Frame, RunState, RunType, SensorSample
@@ -263,19 +273,21 @@ def listen_only(plan: Plan, bus: Bus, path: Path, console: Console) -> tuple[dic
         note(RunState.SILENT.name, "listening")
         monitor = BusMonitor(plan.layout, plan.bench, lambda _, why: note("FRAME_REJECTED", why))
         period_ns, deadline_ns = plan.bench.timing.sample_time_ns, clock.now_ns() + round(plan.duration * 1e9)
-        refused: RefusedError | None = None
+        refused: EmbError | None = None
         try:
             listen(monitor, receive_and_record, clock, period_ns, deadline_ns, lambda *_: False, console.stop_requested)
         except BusError as err:
-            refused = RefusedError(str(err), err.exit_code, fault=Fault.BUS_LOST)
+            refused = err
         statistics, start_conditions = monitor.statistics(), plan.start_conditions(anywhere=False)
         checks = run_checks(findings(plan, bus, start_conditions, statistics, plan.duration, path))
-        refused = refused or first_refusal(checks)
-        if refused is not None and refused.fault is not None:
-            note(refused.fault.name, str(refused))
+        document = reading(plan, statistics, checks, refused or first_refusal(checks))
+        result = document["result"]
+        if result not in (DONE, REFUSED):
+            note(result, document["detail"])
         push_clock(recorder, clock)
-        reading = Reading(plan, statistics, checks, refused)
-        end = reading.trailer()
+        found = {key: document[key] for key in ("detail", "heard", "preflight")}
+        end = log_entries({"exit_reason": result.upper(), **found})
     finally:
         log = recorder.finish(end)
-    return reading.document(log), checks
+    exit_code = document["exit_code"] or (EXIT_DONE if log.complete else EXIT_LOG)
+    return {**document, "exit_code": exit_code, **log_document(log)}, checks
