@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from random import Random
-from typing import Any
 
 import pytest
 
+from emb_runtime.can.codec import Message
 from emb_runtime.can.e2e import CounterCheck
 from emb_runtime.can.receiver import Reception
-from emb_runtime.records import Frame
-from emb_runtime.safety.guard import Guard
 from tests.fuzz import runs
 from tests.fuzz.targets import TARGETS, Played, ViolationError
 
@@ -55,13 +53,9 @@ def an_old_sample_is_good_enough(patch: Patch) -> None:
     patch.setattr("emb_runtime.safety.guard.OLDEST_SAMPLE_PERIODS", 3)
 
 
-def the_guard_mends_what_it_should_reject(patch: Patch) -> None:
-    check = Guard.check
-
-    def careless(self: Guard, frame: Frame, *rest: Any) -> Frame:
-        return check(self, frame._replace(extended=False), *rest)
-
-    patch.setattr(Guard, "check", careless)
+def the_guard_takes_a_29_bit_identifier_for_its_own(patch: Patch) -> None:
+    decode = Message.decode
+    patch.setattr(Message, "decode", lambda self, frame: decode(self, frame._replace(extended=False)))
 
 
 def a_stop_frame_carries_a_current(patch: Patch) -> None:
@@ -79,7 +73,7 @@ def the_loop_fails_at_what_it_does_not_know(patch: Patch) -> None:
         ("reception", permission_never_ends),
         ("guard", the_slew_is_not_limited),
         ("guard", an_old_sample_is_good_enough),
-        ("guard", the_guard_mends_what_it_should_reject),
+        ("guard", the_guard_takes_a_29_bit_identifier_for_its_own),
         ("loop", permission_never_ends),
         ("loop", a_stop_frame_carries_a_current),
         ("loop", the_loop_fails_at_what_it_does_not_know),

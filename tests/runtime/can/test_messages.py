@@ -378,7 +378,8 @@ def test_the_enable_bit_is_read_as_it_was_written() -> None:
 def test_a_command_is_read_as_it_was_written_to_half_a_step() -> None:
     for current in (0.0, -0.0, 1.00009, 1.00011, -3.3333, 6.0, -6.0):
         command = LAYOUT.decode_command(LAYOUT.encode_command(3, 4, current, True))
-        assert command == (3, 4, pytest.approx(current, abs=1e-4 + 1e-12), True)
+        assert (command.counter, command.answers, command.enable) == (3, 4, True)
+        assert command.current == pytest.approx(current, abs=1e-4 + 1e-12)
     with pytest.raises(FrameError):
         LAYOUT.encode_command(3, 4, 6.0002, True)
 
