@@ -61,6 +61,7 @@ LONGEST_BUS = 40  # Characters of the name of a bus
 LARGEST_TEXT = 64 << 10  # Largest bench file and DBC in a log [bytes]
 
 TIMES = ("publish_time", "log_time", "order")  # Columns that every topic has besides its fields
+FRAME = ("id", "data", "publish_time", "is_extended", "is_rtr", "is_error", "dropped")  # Columns of a frame
 TIME = Column("time", "float64", "s")  # Since the first message of the log; all topics have the same zero
 UNIX_TIME = Column("unix_time", "int64", "ns")
 
@@ -386,13 +387,18 @@ class RunLog:
     @cached_property
     def frames(self) -> tuple[Frame, ...]:
         """Every frame in the order in which it was recorded, on the run's monotonic clock; ``own`` if it was sent."""
-        rows: list[tuple[int, Frame]] = []
-        for topic, own in (("/can/rx", False), ("/can/tx", True)):
-            names = ("order", "publish_time", "id", "data", "is_extended", "is_rtr", "is_error", "dropped")
-            for order, when, identifier, data, extended, remote, error, dropped in self.rows(topic, *names):
-                time_ns = when - self.wall_offset_ns
-                rows.append((order, Frame(identifier, data, time_ns, extended, remote, error, own, dropped)))
-        return tuple(frame for _, frame in sorted(rows))
+        return tuple(f._replace(time_ns=f.time_ns - self.wall_offset_ns) for f in self.frames_by_unix_time())
+
+    def frames_by_unix_time(self) -> Iterator[Frame]:
+        """Every frame of a log of any length, as :attr:`frames` has it but with Unix time [ns]."""
+        topics = {name: own for name, own in (("/can/rx", False), ("/can/tx", True)) if self._has(name, FRAME)}
+        for part in self.batches(*topics):
+            rows: list[tuple[int, Frame]] = []
+            for topic, own in topics.items():
+                columns = (part[topic][name].tolist() for name in ("order", *FRAME))
+                for order, identifier, data, when, extended, remote, error, dropped in zip(*columns, strict=True):
+                    rows.append((order, Frame(identifier, data, when, extended, remote, error, own, dropped)))
+            yield from (frame for _, frame in sorted(rows))
 
     @cached_property
     def events(self) -> tuple[Event, ...]:
@@ -486,7 +492,9 @@ def read_log(path: str | Path) -> RunLog:
         why = "; ".join(contents.missing) or "it holds none"
         raise LogError(f"{path}: not one message is left in this log: {why}")
     topics = _topics(path, contents, counts)
-    missing = missing_in(contents)
+    missing, dropped = [*contents.missing], contents.metadata.get("emb.end", {}).get("dropped_records", "0")
+    if dropped != "0":
+        missing.append(f"{dropped} records were dropped while recording")
     return RunLog(
         path=path,
         complete=not missing,
@@ -512,12 +520,6 @@ def end_detail(end: Mapping[str, str]) -> str:
     stopped = "" if node in ("NONE", "NEVER_COMMANDED") else f"stop reason of the node: {node}"
     cause = FAULTS[Fault[end["exit_reason"]]].cause if end.get("exit_reason") in Fault.__members__ else ""
     return "; ".join(filter(None, (end.get("detail") or cause, stopped)))
-
-
-def missing_in(log: McapFile) -> tuple[str, ...]:
-    """Descriptions of the missing parts of a log that was read: what is damaged, and what it itself reports."""
-    dropped = log.metadata.get("emb.end", {}).get("dropped_records", "0")
-    return (*log.missing, *((f"{dropped} records were dropped while recording",) if dropped != "0" else ()))
 
 
 def _topics(path: Path, contents: McapFile, counts: Mapping[int, int]) -> dict[str, _Topic]:
