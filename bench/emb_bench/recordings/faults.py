@@ -19,6 +19,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from emb_bench.recordings.map_file import RecordingMap
 from emb_runtime.errors import UsageError
 
 Floats = NDArray[np.float64]
@@ -285,25 +286,13 @@ ANGLES: Checks[Series] = {
 # ---- the equations ----
 
 
-class Motion(NamedTuple):
-    """A recording on its grid, and what its map says of it; NaN where a sample is lost."""
-
-    angle: Floats  # Shape (n + 1,)
-    velocity: Floats | None  # As measured, shape (n + 1,); None where it was derived
-    currents: Floats  # What acted in each period, as the map says, shape (n,)
-    sample_time: float  # [s]
-    noise: float  # Standard deviation of the angle
-    by: str  # Signal that says what acted: ``command`` or ``current``
-    delay: float  # That the map gives it [s]
-    known: Mapping[str, float]  # Parameters by their place in the equations
-    guess: Mapping[str, float]
-
-
 @dataclass(frozen=True, eq=False)
 class Equation:
     """Second differences of the angle over spans of a recording, and of the double integrals of its torques."""
 
-    motion: Motion
+    wanted: RecordingMap  # As the map says
+    samples: Floats  # Angle and velocity on the grid, NaN where lost, shape (n + 1, 2)
+    t_s: float  # Sample time [s]
     left: Floats  # Second differences of the angle, shape (m,)
     loads: Mapping[str, Floats]  # Those of friction, spring and a constant, by the parameter that they belong to
     drive: Floats  # Double integral of what acts, at each sample, shape (n + 1,)
@@ -331,37 +320,37 @@ class Equation:
         return max(((delay, self.correlation(delay)) for delay in near), key=lambda pair: pair[1])
 
 
-def equation_of(motion: Motion) -> Equation | None:
+def equation_of(samples: Floats, currents: Floats, t_s: float, wanted: RecordingMap) -> Equation | None:
     """The equation of a recording; None where nothing moves by more than its noise, or too little of it is left."""
-    n = min(len(motion.currents), MOST)
-    t_s, raw = motion.sample_time, motion.angle[: n + 1]
+    n, noise = min(len(currents), MOST), wanted.signals.angle.noise
+    raw = samples[: n + 1, 0]
     there = np.isfinite(raw)
     angle = np.interp(np.arange(n + 1), np.flatnonzero(there), raw[there])
     for span in SPANS:
         left = _second(angle, span)
         kept = ~np.isnan(_second(raw, span))
-        if kept.sum() > 10 * span and math.sqrt(float(np.mean(left[kept] ** 2))) > TOLD * motion.noise:
+        if kept.sum() > 10 * span and math.sqrt(float(np.mean(left[kept] ** 2))) > TOLD * noise:
             break
     else:
         return None
     travel = np.diff(angle)
     half = span // 2
     around = np.convolve(travel, np.ones(2 * half + 1), "same")
-    turning = np.where(np.abs(around) > 5.0 * motion.noise, np.sign(around), 0.0)
+    turning = np.where(np.abs(around) > 5.0 * noise, np.sign(around), 0.0)
     middle = 0.5 * (angle[1:] + angle[:-1])
     loads = {
         "T_c": _double(-turning, t_s),
         "f_v": np.concatenate([[0.0], np.cumsum(-(middle - angle[0]) * t_s)]),
         "offset": _double(np.ones(n), t_s),
     }
-    if "k_1" in motion.known or "k_1" in motion.guess:
+    if "k_1" in wanted.machine.parameters:
         loads["k_1"] = _double(-np.maximum(middle, 0.0), t_s)
     latest = max(min(LATEST, n // 10), 2)
     kept[:latest] = kept[-latest:] = False  # what acts late there is not in the recording
     second = {name: _second(load, span)[kept] for name, load in loads.items()}
-    drive = _double(np.nan_to_num(motion.currents[:n]), t_s)
+    drive = _double(np.nan_to_num(currents[:n]), t_s)
     others = np.linalg.qr(np.stack([*second.values()], axis=1))[0]
-    return Equation(motion, left[kept], second, drive, span, kept, others, latest)
+    return Equation(wanted, samples, t_s, left[kept], second, drive, span, kept, others, latest)
 
 
 def _second(row: Floats, span: int) -> Floats:
@@ -377,12 +366,12 @@ def _double(rate: Floats, t_s: float) -> Floats:
 
 def _ways(e: Equation) -> tuple[float, float]:
     """Correlation of the ways of the angle with those that the velocity says, and their ratio; NaN without any."""
-    velocity, span = e.motion.velocity, e.span
-    if velocity is None:
+    angle, velocity = e.samples.T
+    if e.wanted.signals.velocity is None:  # it was derived
         return math.nan, math.nan
-    steps = 0.5 * (velocity[1:] + velocity[:-1]) * e.motion.sample_time
-    said = np.lib.stride_tricks.sliding_window_view(steps, span).sum(axis=1)
-    seen = e.motion.angle[span:] - e.motion.angle[:-span]
+    steps = 0.5 * (velocity[1:] + velocity[:-1]) * e.t_s
+    said = np.lib.stride_tricks.sliding_window_view(steps, e.span).sum(axis=1)
+    seen = angle[e.span :] - angle[: -e.span]
     said, seen = (row[np.isfinite(said) & np.isfinite(seen)] for row in (said, seen))
     if not len(seen):
         return math.nan, math.nan
@@ -405,7 +394,7 @@ def _velocity_scaled(e: Equation) -> Found:
 
 
 def _driven_against(e: Equation) -> Found:
-    return {"by": e.motion.by} if e.correlation(0.0) < -0.5 and e.best[1] < 0.8 else None
+    return {"by": e.wanted.signals.acting} if e.correlation(0.0) < -0.5 and e.best[1] < 0.8 else None
 
 
 def _is_late(e: Equation) -> Found:
@@ -413,8 +402,13 @@ def _is_late(e: Equation) -> Found:
     rest, now = 1.0 - correlation**2, 1.0 - max(e.correlation(0.0), 0.0) ** 2
     if EARLY < best < LATE or abs(best) > e.latest or correlation < 0.8 or rest > BETTER * now:
         return None
-    delay, how = e.motion.delay + best * e.motion.sample_time, "late" if best > 0.0 else "early"
-    return {"by": e.motion.by, "samples": abs(best), "how": how, "delay": delay}
+    by, how = e.wanted.signals.acting, "late" if best > 0.0 else "early"
+    return {
+        "by": by,
+        "samples": abs(best),
+        "how": how,
+        "delay": e.wanted.signals.given[by].delay + best * e.t_s,
+    }
 
 
 def _told_shares(e: Equation) -> tuple[dict[str, float], dict[str, float]]:
@@ -424,7 +418,7 @@ def _told_shares(e: Equation) -> tuple[dict[str, float], dict[str, float]]:
     spread = float(np.mean((e.left - columns @ found) ** 2))
     sure = SURE * np.sqrt(np.abs(np.diag(np.linalg.pinv(columns.T @ columns))) * spread)
     told = {name: c for name, c, least in zip(names, found.tolist(), sure.tolist(), strict=True) if c > least}
-    return told, ({} if "k_m" in e.motion.guess else {"k_m": 1.0}) | dict(e.motion.known)
+    return told, ({} if "k_m" in e.wanted.machine.guess.given else {"k_m": 1.0}) | e.wanted.machine.known.given
 
 
 def _driven_scaled(e: Equation) -> Found:
@@ -432,7 +426,7 @@ def _driven_scaled(e: Equation) -> Found:
     if not {"J", "k_m"} <= {*known} or "k_m" not in told:
         return None
     ratio = told["k_m"] * known["J"] / known["k_m"]
-    return {"by": e.motion.by, "ratio": ratio} if not 1.0 / WRONG < ratio < WRONG else None
+    return {"by": e.wanted.signals.acting, "ratio": ratio} if not 1.0 / WRONG < ratio < WRONG else None
 
 
 def _is_far(e: Equation) -> Found:
@@ -443,7 +437,7 @@ def _is_far(e: Equation) -> Found:
     values = {"J": inertia} | {name: share * inertia / gears.get(name, 1.0) for name, share in told.items()}
     wrong = {
         name: values[name]
-        for name, guess in e.motion.guess.items()
+        for name, guess in e.wanted.machine.guess.given.items()
         if name in values and abs(math.log(values[name] / guess)) > math.log(FACTOR)
     }
     shown = ", ".join(f"{name} = {value:.2g}" for name, value in wrong.items())
@@ -465,7 +459,10 @@ EQUATIONS: Checks[Equation] = {
 }
 
 
-def contradictions(motion: Motion) -> tuple[str, ...]:
-    """Contradictions of a map by its recording, the cause of others first."""
-    equation = equation_of(motion)
+def contradictions(samples: Floats, currents: Floats, t_s: float, wanted: RecordingMap) -> tuple[str, ...]:
+    """Contradictions of a map by its recording, the cause of others first.
+
+    Samples on the grid and what acted in each period, as the map says; shapes (n + 1, 2) and (n,), sample time in s.
+    """
+    equation = equation_of(samples, currents, t_s, wanted)
     return () if equation is None else tuple(found_by(EQUATIONS, equation))

@@ -99,6 +99,11 @@ class Signals(msgspec.Struct, frozen=True, kw_only=True):
         names = ("angle", "velocity", "command", "current")
         return {name: signal for name in names if (signal := getattr(self, name)) is not None}
 
+    @property
+    def acting(self) -> str:
+        """Name of the signal that says what acted: the current where it was measured, else the command."""
+        return "command" if self.current is None else "current"
+
 
 class Source(msgspec.Struct, frozen=True, kw_only=True):
     """The file of a recording."""

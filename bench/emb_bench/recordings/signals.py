@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.experiment.experiment import Experiment, Lack, Quality
-from emb_bench.recordings.faults import ANGLES, HUGE, TIMES, VALUES, WRAPPED, Motion, Series, contradictions, require
+from emb_bench.recordings.faults import ANGLES, HUGE, TIMES, VALUES, WRAPPED, Series, contradictions, require
 from emb_bench.recordings.map_file import TIME, TIMED, Place, RecordingMap, Signal
 from emb_bench.recordings.readers import Column, Floats
 from emb_bench.sim.instruments import Tracked, observe, observer_noise
@@ -87,20 +87,6 @@ def experiment_of(
     whole = slice(int(np.argmax(received)), int(np.flatnonzero(received)[-1]) + 1)
     samples = np.where(received[:, None], np.stack([angle, velocity], axis=1), np.nan)[whole]
     received, late, currents = received[whole], late[whole] - late[whole.start], applied[whole][1:]
-    by, machine = "current" if "current" in given else "command", wanted.machine
-    faults = contradictions(
-        Motion(
-            angle=samples[:, 0],
-            velocity=None if bandwidth else samples[:, 1],
-            currents=currents,
-            sample_time=t_s,
-            noise=angle_noise,
-            by=by,
-            delay=given[by].delay,
-            known=machine.known.given,
-            guess=machine.guess.given,
-        )
-    )
     start = float(samples[0, 0]), float(samples[0, 1])
     experiment = Experiment(
         name=name,
@@ -116,7 +102,7 @@ def experiment_of(
         quality=Quality(
             planned=len(currents),
             lacks=_lacks(wanted, kind, bandwidth, int((~received).sum())) | {**lacks},
-            faults=faults,
+            faults=contradictions(samples, currents, t_s, wanted),
         ),
     )
     return Found(experiment, t_s, (angle_noise, velocity_noise), bandwidth)
