@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from emb_bench.brake.motion import Floats, no_sensitivity, rest
 from emb_bench.compiled import compiled
-from emb_bench.config.plants import BUILT_IN, Mechanics
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import BUILT_IN, Mechanics, Plant
 from emb_bench.experiment.experiment import planned
 from emb_bench.experiment.simulate import Theta, simulate
+from emb_bench.information.fisher import Fisher, Kind, information_over_time, weights_along
 from emb_bench.sim.open_loop import held, march, trajectory
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
 
@@ -144,3 +146,27 @@ def euler_states(
 ) -> Floats:
     """States of an Euler brake, shape (n + 1, 2)."""
     return simulate(BUILT_IN["euler"], Theta(p, x0), planned(currents), T_S).states
+
+
+def fisher(
+    bench: Bench,
+    p: BrakeParameters,
+    currents: Sequence[float] | Floats,
+    *,
+    kind: Kind,
+    plant: Plant,
+    params: Sequence[str] = PARAMETER_NAMES,
+    nuisances: Sequence[str] = (),
+    x0: tuple[float, float] = (0.0, 0.0),
+    prior: Floats | None = None,
+    measured: Any = None,
+) -> Fisher:
+    """The Fisher information that currents [A] draw from a brake, in plain Python and all at once.
+
+    ``measured`` is False for a lost sample.
+    """
+    names = (*params, *nuisances)
+    run = simulate(plant, Theta(p, x0), planned(currents), bench.timing.sample_time, names)
+    weights = weights_along(bench, kind, plant.instruments, run.states)
+    matrix = information_over_time(run.sensitivities, weights, prior, measured)[-1]
+    return Fisher(kind, names, p, matrix, prior, plant.name, tuple(nuisances))

@@ -21,7 +21,6 @@ from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import Instruments, Plant
 from emb_bench.estimate.expected import IntervalCriterion, of_experiment, sampled
 from emb_bench.information.evaluation import Question
-from emb_bench.information.fisher import fisher
 from emb_bench.information.symmetric import unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
@@ -41,6 +40,8 @@ from emb_train.lies import LIES
 from emb_train.presets import preset_summaries
 from emb_train.rewards import Transition, penalised_increment
 from emb_train.training import load_preset
+
+from tests.bench.flows import fisher  # isort: skip
 from tests.benches import SENSOR_BENCH
 
 BENCH = SENSOR_BENCH

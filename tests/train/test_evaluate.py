@@ -18,7 +18,6 @@ from emb_bench.config.bench import load_bench, parse_bench
 from emb_bench.design.problem import Problem, make_problem
 from emb_bench.excitation import parse_excitation, run_excitation
 from emb_bench.information.criteria import Criterion
-from emb_bench.information.fisher import fisher
 from emb_bench.parallel import processes
 from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.errors import PolicyRefusedError, UsageError
@@ -30,6 +29,8 @@ from emb_train.evaluate import Settings, Subject, document, evaluate, open_subje
 from emb_train.optimum import followed, optima, searchable
 from emb_train.play import MEASURES, Draw, Estimating, Law, Played, fresh_draws, mean_score, play
 from emb_train.training import ONNX, PLAN
+
+from tests.bench.flows import fisher  # isort: skip
 from tests.benches import SENSOR_BENCH
 from tests.commands import refused
 from tests.train.trainings import HORIZON

@@ -91,10 +91,10 @@ def _of_the_run(log: RunLog) -> Row:
         "angle_max": largest and largest.angle_max,
         "speed_max": largest and largest.speed,
         "current_max": largest and largest.current,
-        "limited": cycles.limited,
-        "returning": cycles.returning,
-        "clipped": cycles.clipped,
-        "missed": cycles.missed_periods,
+        "limited": cycles["limited"],
+        "returning": cycles["returning"],
+        "clipped": cycles["clipped"],
+        "missed": cycles["missed_periods"],
     }
 
 

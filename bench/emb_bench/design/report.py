@@ -22,7 +22,7 @@ from emb_bench.estimate.expected import IntervalCriterion
 from emb_bench.experiment.experiment import planned
 from emb_bench.experiment.simulate import Theta, simulate
 from emb_bench.information.criteria import Criterion, criteria
-from emb_bench.information.fisher import Kind, fisher
+from emb_bench.information.fisher import Kind, information_over_time, weights_along
 from emb_bench.information.symmetric import Floats
 from emb_bench.output import replacing
 from emb_runtime.errors import UsageError
@@ -61,9 +61,8 @@ def check(bench: Bench, problem: Problem, kind: Kind, currents: Floats, plant_na
     t_s, p = problem.sample_time, problem.brake
     parts = PARTS if plant.mechanics.solver == EXACT else 1
     states = simulate(plant, Theta(p), planned(np.repeat(currents, parts)), t_s / parts).states
-    matrix = fisher(
-        bench, p, currents, kind=kind, plant=plant, params=problem.params
-    ).matrix  # relative to the parameters of the problem, which are known
+    run = simulate(plant, Theta(p), planned(currents), t_s, problem.params)
+    matrix = information_over_time(run.sensitivities, weights_along(bench, kind, plant.instruments, run.states))[-1]
     found = criteria(matrix, problem.params)
     limits, home = bench.limits, bench.shield
     low, high, speed = float(states[:, 0].min()), float(states[:, 0].max()), float(np.abs(states[:, 1]).max())

@@ -19,14 +19,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from emb_bench.config.bench import Bench
-from emb_bench.config.plants import Instruments, Plant
-from emb_bench.experiment.experiment import planned
-from emb_bench.experiment.simulate import Theta, simulate
+from emb_bench.config.plants import Instruments
 from emb_bench.information.criteria import Criteria, criteria
 from emb_bench.information.identifiability import Identifiability, Spectrum, judge
 from emb_bench.information.symmetric import Floats, pack, unpack, upper
 from emb_bench.sim.open_loop import check_unknowns
-from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Limits, Noise, Ranges
+from emb_runtime.config.bench import BrakeParameters, Limits, Noise, Ranges
 from emb_runtime.errors import UsageError
 
 Kind = Literal["physical", "weighted"]
@@ -187,32 +185,3 @@ def _borders(params: Sequence[str], theta: BrakeParameters, ranges: Ranges | Non
             own = getattr(theta, name)
             found[name] = (own - low) / own, (high - own) / own
     return found
-
-
-def fisher(
-    bench: Bench,
-    p: BrakeParameters,
-    currents: Sequence[float] | Floats,
-    *,
-    kind: Kind,
-    plant: Plant,
-    params: Sequence[str] = PARAMETER_NAMES,
-    nuisances: Sequence[str] = (),
-    x0: tuple[float, float] = (0.0, 0.0),
-    prior: Floats | None = None,
-    measured: Any = None,
-) -> Fisher:
-    """The Fisher information that a sequence of currents [A] draws from a brake whose parameters are the true ones.
-
-    Rows of nuisances come after those of ``params``; what is not named is known. The prior is the FIM of all of them
-    before the first sample; ``measured`` is False for a lost sample.
-    """
-    if not params:
-        raise UsageError(f"expected at least one parameter, such as {', '.join(PARAMETER_NAMES)}")
-    names = (*params, *nuisances)
-    run = simulate(plant, Theta(p, x0), planned(currents), bench.timing.sample_time, names)
-    weights = weights_along(bench, kind, plant.instruments, run.states)
-    history = information_over_time(run.sensitivities, weights, prior, measured)
-    before = np.zeros((len(names), len(names))) if prior is None else np.asarray(prior, dtype=np.float64)
-    matrix = history[-1] if len(history) else before
-    return Fisher(kind, names, p, matrix, prior, plant.name, tuple(nuisances))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -19,26 +18,11 @@ from emb_runtime.records import CycleRecord, Reason
 
 _REASONS = {
     "unanswered": Reason.MISSED | Reason.LEFT,
-    "left": Reason.LEFT,
+    "left": Reason.LEFT,  # To the node, out of reach of slew or limit
     "clipped": Reason.CLIPPED,
     "limited": Reason.LIMITED,
     "returning": Reason.RETURNING,
 }
-
-
-@dataclass(frozen=True)
-class CycleCounts:
-    """Counts of the control cycles."""
-
-    recorded: int = 0
-    active: int = 0  # Of the experiment, or of the way home, itself
-    answered: int = 0
-    missed_periods: int = 0
-    unanswered: int = 0
-    left: int = 0  # Left to the node, out of reach of slew or limit
-    clipped: int = 0
-    limited: int = 0
-    returning: int = 0
 
 
 @dataclass(frozen=True)
@@ -55,7 +39,9 @@ class Largest:
 class CycleSummary:
     """Counts, extremes and delays of the control cycles."""
 
-    cycles: CycleCounts
+    cycles: Mapping[str, int]
+    """Number of those that were ``recorded``; of those of the experiment, or of the way home, itself how many are
+    ``active`` and ``answered``, how many ``missed_periods`` lie between them, and how many have each reason."""
     largest: Largest | None  # None without an active cycle
     sensor_to_command: Mapping[str, float]
     """Quantiles of the time from a sample to the command that answers it [s]; empty without an answer."""
@@ -87,7 +73,7 @@ def info_document(log: RunLog) -> dict[str, Any]:
         "attachments": {name: len(data) for name, data in log.attachments.items()},
         "messages": log.counts,
         "events": [{"time": event.time_ns, "code": event.code, "text": event.text} for event in log.events],
-        "cycles": asdict(found.cycles),
+        "cycles": found.cycles,
         **{name: entry for name, entry in optional.items() if entry},
     }
 
@@ -95,7 +81,7 @@ def info_document(log: RunLog) -> dict[str, Any]:
 def cycle_summary(log: RunLog) -> CycleSummary:
     """Summary of the control cycles, batch by batch: the part of :func:`info_document` that takes time."""
     log.require("/cycle", CycleRecord._fields)
-    counts: Counter[str] = Counter()
+    counts = dict.fromkeys(("recorded", "active", "answered", "missed_periods", *_REASONS), 0)
     low, high, speed, current = math.inf, -math.inf, 0.0, 0.0
     delays = [np.empty(0, np.int64)]
     for part in log.batches("/cycle"):
@@ -119,9 +105,7 @@ def cycle_summary(log: RunLog) -> CycleSummary:
     if counts["active"]:
         its_low, its_high, its_speed = (_counted(log, name) for name in ("angle_min", "angle_max", "top_speed"))
         largest = Largest(min(low, its_low), max(high, its_high), max(speed, its_speed), current)
-    return CycleSummary(
-        CycleCounts(**counts), largest, quantiles(np.asarray(1e-9 * np.concatenate(delays), np.float64))
-    )
+    return CycleSummary(counts, largest, quantiles(np.asarray(1e-9 * np.concatenate(delays), np.float64)))
 
 
 def _counted(log: RunLog, name: str) -> float:

@@ -14,8 +14,9 @@ from emb_bench.config.bench import load_bench
 from emb_bench.design.report import read_design
 from emb_bench.experiment.experiment import planned
 from emb_bench.experiment.simulate import Theta, simulate
-from emb_bench.information.fisher import fisher
 from emb_runtime.errors import EXIT_INTERRUPTED, UsageError
+
+from tests.bench.flows import fisher  # isort: skip
 from tests.benches import SENSOR_TEXT
 
 PERIODS = 50

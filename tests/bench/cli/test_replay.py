@@ -16,7 +16,6 @@ import pytest
 from emb_bench import api
 from emb_bench.cli.replay import COMMANDS, main
 from emb_bench.config.bench import Bench
-from emb_bench.information.fisher import fisher
 from emb_bench.logs.estimates import last_estimate
 from emb_bench.logs.log import read_log
 from emb_runtime.can.messages import Layout
@@ -24,6 +23,7 @@ from emb_runtime.config.bench import Sensors
 from emb_runtime.numbers import plain
 from emb_runtime.records import CycleRecord
 
+from tests.bench.flows import fisher  # isort: skip
 from tests.bench.conftest import Log, Replay  # isort: skip
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.conftest import SimRun, Simulate  # isort: skip

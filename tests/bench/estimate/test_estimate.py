@@ -12,10 +12,11 @@ from emb_bench.estimate.output_error import search, start_points
 from emb_bench.estimate.records import METHODS, EstimationProblem
 from emb_bench.experiment.experiment import Experiment, planned
 from emb_bench.experiment.simulate import Theta, simulate
-from emb_bench.information.fisher import fisher, uniform_prior
+from emb_bench.information.fisher import uniform_prior
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import LogError, UsageError
 
+from tests.bench.flows import fisher  # isort: skip
 from tests.bench.measurements import (  # isort: skip
     currents_of,
     errors_in_sigmas,

@@ -15,7 +15,6 @@ from emb_bench.experiment.simulate import Theta, simulate
 from emb_bench.information.fisher import (
     Fisher,
     Kind,
-    fisher,
     information_over_time,
     physical_weights,
     thesis_weights,
@@ -26,7 +25,7 @@ from emb_bench.information.identifiability import Border
 from emb_bench.information.symmetric import Floats, log_det, pack
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
-from tests.bench.flows import euler_states, of_euler, square
+from tests.bench.flows import euler_states, fisher, of_euler, square
 from tests.benches import SENSOR_BENCH
 
 BENCH = SENSOR_BENCH
