@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -52,12 +52,12 @@ class Filter:
     def gains(self, z: Floats, weights: Sequence[Floats]) -> list[Floats]:
         """Gains of each experiment along the motion for ``z``, shape (n, 2, 4), in the order of ``GAIN``."""
         gains = [np.zeros((*root.shape, GAIN)) for root in weights]
-        self._parts(z, weights, gains, False, ())
+        self._parts(z, weights, gains, held=False)
         return gains
 
     def jacobian(self, z: Floats, weights: Sequence[Floats], gains: Sequence[Floats]) -> tuple[Floats, Floats]:
         """Whitened innovations with these gains, and their derivatives to z, as :meth:`Problem.jacobian`."""
-        return self.problem.stacked(z, self._parts(z, weights, gains, True, ()))
+        return self.problem.stacked(z, self._parts(z, weights, gains, held=True))
 
     def deviance(self, z: Floats, weights: Sequence[Floats]) -> float:
         """Minus twice the logarithm of the likelihood, prior included, but for a constant."""
@@ -70,12 +70,10 @@ class Filter:
         return float(errors @ errors) + growth
 
     def _parts(
-        self, z: Floats, weights: Sequence[Floats], gains: Sequence[Floats], held: bool, besides: tuple[str, ...]
+        self, z: Floats, weights: Sequence[Floats], gains: Sequence[Floats], *, held: bool
     ) -> list[tuple[Floats, Floats]]:
-        return [
-            self.followed(z, i, root, gain, held, besides)
-            for i, (root, gain) in enumerate(zip(weights, gains, strict=True))
-        ]
+        pairs = enumerate(zip(weights, gains, strict=True))
+        return [self.followed(z, i, root, gain, held=held) for i, (root, gain) in pairs]
 
     def followed(
         self,
@@ -83,9 +81,9 @@ class Filter:
         i: int,
         root: Floats,
         gain: Floats,
+        *,
         held: bool = True,
         besides: tuple[str, ...] = (),
-        *,
         mechanics: Mechanics | None = None,
         parts: tuple[Integers, Floats] | None = None,
         shifted: Floats | float = 0.0,
@@ -164,33 +162,24 @@ class Followed:
 
     def columns(self, experiment: int, names: tuple[str, ...]) -> Floats:
         """Derivatives of what is shown to other unknowns, in standard deviations, shape (n, names, 2)."""
-        _, shares = self.filter.followed(
-            self.z, experiment, self.weights[experiment], self.gains[experiment], besides=names
-        )
-        return shares[:, -len(names) :]
+        return self._followed(experiment, besides=names)[1][:, -len(names) :]
 
     def parts(self, experiment: int, unknowns: Integers, shares: Floats) -> Floats:
         """Derivatives to unknowns that count by shares, in standard deviations, shape (n, m, 2)."""
-        weights, gains = self.weights[experiment], self.gains[experiment]
-        _, found = self.filter.followed(self.z, experiment, weights, gains, parts=(unknowns, shares))
-        return found[:, -len(unknowns) :]
+        return self._followed(experiment, parts=(unknowns, shares))[1][:, -len(unknowns) :]
 
     def shown(self, experiment: int, mechanics: Mechanics) -> Floats:
         """Expected less measured samples of another brake under the same currents, whitened."""
-        weights, gains = self.weights[experiment], self.gains[experiment]
-        return -self.filter.followed(self.z, experiment, weights, gains, mechanics=mechanics)[0]
+        return -self._followed(experiment, mechanics=mechanics)[0]
 
     def whitened(self, experiment: int, shift: Floats) -> Floats:
         """A small change of what is shown, shape (n, 2), as the innovations have it."""
-        weights, gains = self.weights[experiment], self.gains[experiment]
-        whole, _ = self.filter.followed(self.z, experiment, weights, gains, shifted=shift)
-        without, _ = self.filter.followed(self.z, experiment, weights, gains)
-        return whole - without
+        return self._followed(experiment, shifted=shift)[0] - self._followed(experiment)[0]
 
     def motion(self, experiment: int) -> Floats:
         """Angle and velocity that are expected of each sample from those before, shape (n, 2)."""
         root, scale = self.weights[experiment], self.gains[experiment][:, :, 2]
-        innovations, _ = self.filter.followed(self.z, experiment, root, self.gains[experiment])
+        innovations, _ = self._followed(experiment)
         expected, instants = np.zeros_like(root), np.arange(len(root))
         for output in range(2):
             counts = root[:, output] > 0.0
@@ -199,6 +188,10 @@ class Followed:
                 at = seen - innovations[counts, output] / scale[counts, output]
                 expected[:, output] = np.interp(instants, instants[counts], at)
         return expected
+
+    def _followed(self, experiment: int, **changes: Any) -> tuple[Floats, Floats]:
+        """:meth:`Filter.followed` at the estimate, with some of its options."""
+        return self.filter.followed(self.z, experiment, self.weights[experiment], self.gains[experiment], **changes)
 
 
 class FilterInput(NamedTuple):

@@ -29,7 +29,7 @@ from emb_bench.estimate.model_validation import examine
 from emb_bench.estimate.output_error import finished, start_points
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Disturbance
-from emb_bench.estimate.search import converge, strong, strong_load
+from emb_bench.estimate.search import converge, strong
 from emb_bench.information.fisher import information_of_range
 
 POWERS = {"walk": range(2, -7, -1), "load": range(0, -5, -1)}
@@ -104,8 +104,7 @@ class _Place(NamedTuple):
 
 def _place(base: Filter, kind: str, power: float, near: Floats) -> _Place:
     """A disturbance with one of its walks replaced by a power of ten of its unit."""
-    unit = {"walk": strong, "load": strong_load}[kind](base.problem)
-    found = replace(base, **{kind: unit * 10.0**power})
+    found = replace(base, **{kind: strong(base.problem, kind) * 10.0**power})
     return _Place(found, *_least(found, near))
 
 
@@ -120,8 +119,7 @@ def _roughly(base: Filter, kind: str, near: Floats) -> _Place:
 
 def _refined(base: Filter, kind: str, rough: _Place) -> _Place:
     """The likeliest size of one kind of walk near a rough one, the other kind as it is."""
-    unit = {"walk": strong, "load": strong_load}[kind](base.problem)
-    power = math.log10(getattr(rough.filter, kind) / unit)
+    power = math.log10(getattr(rough.filter, kind) / strong(base.problem, kind))
     sought = minimize_scalar(
         lambda x: _place(base, kind, x, rough.z).deviance,
         bounds=(power - 1.0, power + 1.0),

@@ -78,15 +78,15 @@ def minimise(
     return End(of(found.x), 2.0 * float(found.cost), start, found.status > 0, int(found.nfev))
 
 
-def strong(problem: Problem) -> float:
-    """The disturbance that makes the velocity walk by the bench's noise in a period [rad/s per √s]."""
-    return problem.bench.noise.velocity / math.sqrt(problem.bench.timing.sample_time)
+def strong(problem: Problem, kind: str = "walk") -> float:
+    """The random walk that moves the velocity by the bench's noise in a period, by the field of a :class:`Filter`.
 
-
-def strong_load(problem: Problem) -> float:
-    """The walk of a load that moves the velocity by the bench's noise in a period [A per √s]."""
-    brake, t_s = problem.bench.brake, problem.bench.timing.sample_time
-    return problem.bench.noise.velocity * brake.J / (brake.k_m * t_s * math.sqrt(t_s))
+    That of the velocity itself [rad/s per √s], or of a ``load`` [A per √s].
+    """
+    brake, noise, t_s = problem.bench.brake, problem.bench.noise.velocity, problem.bench.timing.sample_time
+    if kind == "walk":
+        return noise / math.sqrt(t_s)
+    return noise * brake.J / (brake.k_m * t_s * math.sqrt(t_s))
 
 
 def converge(found: Filter, start: Floats) -> End:
