@@ -13,7 +13,7 @@ from emb_bench.brake.parameters import Quantity, quantity
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Plant
 from emb_bench.estimate.effects import SCALES
-from emb_bench.estimate.intervals import deviations, unnoticed
+from emb_bench.estimate.intervals import deviations, largest, unnoticed
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import NORMAL_95, Contribution, End, EstimationProblem, ModelValidation, Unknown
 from emb_bench.experiment.experiment import Experiment
@@ -150,8 +150,7 @@ class Estimate:
 
     def open(self, shared: Sequence[str] = ()) -> Floats:
         """Root mean square bias of each unknown by effects that are not estimated, but those ``shared``."""
-        parts = [one.bias for one in self.validation.budget if one.name not in shared]
-        return unnoticed(np.array(parts).reshape(-1, len(self.unknowns)))
+        return unnoticed(self.validation.budget, len(self.unknowns), shared)
 
     def ratios(self) -> list[Ratio]:
         """Ratios of the parameters to J: no error of J is in them."""
@@ -161,11 +160,10 @@ class Estimate:
             if name not in PARAMETER_NAMES:
                 continue
             at, signs = [i, *inertia], np.array([1.0, -1.0])[: 1 + len(inertia)]
-            biases = np.array([[one.bias[k] for k in at] for one in self.validation.budget if one.name != "J"])
+            moved = [float(signs @ [one.bias[k] for k in at]) for one in self.validation.budget if one.name != "J"]
             covariances = (Spectrum(self.information).inverse(), self.sandwich)
             bound, robust = (np.sqrt(max(float(signs @ c[np.ix_(at, at)] @ signs), 0.0)) for c in covariances)
-            open_by = unnoticed(biases.reshape(-1, len(at)) @ signs)
-            deviation = float(deviations(bound, open_by, robust, fits=self.validation.fits))
+            deviation = float(deviations(bound, np.asarray(np.linalg.norm(moved)), robust, fits=self.validation.fits))
             of, value = quantity(self.bench.machine, name), float(self.values[i] / self.theta.J)
             half = NORMAL_95 * deviation * value
             found.append(
@@ -175,8 +173,7 @@ class Estimate:
 
     def left_open_by(self, i: int) -> Contribution | None:
         """The largest entry of the uncertainty budget of unknown ``i``; None without any."""
-        found = [one for one in self.validation.budget if one.bias[i] != 0.0]
-        return max(found, key=lambda one: abs(one.bias[i]), default=None)
+        return largest(self.validation.budget, i)
 
     def effects(self, i: int) -> dict[str, tuple[float, float]]:
         """Biases of unknown ``i`` by effects, with their sizes; not by those that move all runs on one bench alike."""

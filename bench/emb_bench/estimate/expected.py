@@ -26,7 +26,7 @@ from emb_bench.config.plants import Plant
 from emb_bench.estimate.average import average
 from emb_bench.estimate.effects import Simulated, columns, lacked_sensitivities, with_systematic
 from emb_bench.estimate.estimate import OF_THE_BENCH
-from emb_bench.estimate.intervals import unnoticed
+from emb_bench.estimate.intervals import largest, unnoticed
 from emb_bench.estimate.prediction import Problem, make_problem
 from emb_bench.estimate.records import Contribution, EstimationProblem
 from emb_bench.estimate.suspects import basis_and_inverse, budget_of, lacking
@@ -78,12 +78,10 @@ class Interval:
 
     def largest(self, i: int, shared: Sequence[str] = OF_THE_BENCH) -> Contribution | None:
         """The largest entry of the budget of an unknown, without those ``shared``; None without any."""
-        found = [one for one in self.budget if one.bias[i] != 0.0 and one.name not in shared]
-        return max(found, key=lambda one: abs(one.bias[i]), default=None)
+        return largest(self.budget, i, shared)
 
     def _with(self, without: Sequence[str]) -> Floats:
-        biases = [one.bias for one in self.budget if one.name not in without]
-        together: Floats = np.hypot(self.repeatability, unnoticed(np.array(biases).reshape(-1, len(self.names))))
+        together: Floats = np.hypot(self.repeatability, unnoticed(self.budget, len(self.names), without))
         return together
 
 

@@ -12,18 +12,27 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from emb_bench.brake.motion import Floats
+from emb_bench.estimate.records import Contribution
 
 Interval = tuple[float, float]
 
 
-def unnoticed(biases: Floats) -> Floats:
-    """Root mean square bias of each unknown from those by each effect, shape (effects, unknowns)."""
+def unnoticed(budget: Sequence[Contribution], unknowns: int, without: Sequence[str] = ()) -> Floats:
+    """Root mean square bias of each of so many unknowns by the effects of a budget, but for some of them."""
+    biases = np.array([one.bias for one in budget if one.name not in without]).reshape(-1, unknowns)
     total: Floats = np.sqrt(np.sum(biases**2, axis=0))
     return total
+
+
+def largest(budget: Sequence[Contribution], i: int, without: Sequence[str] = ()) -> Contribution | None:
+    """The largest entry of a budget for unknown ``i``, but for some of them; None without any."""
+    found = [one for one in budget if one.bias[i] != 0.0 and one.name not in without]
+    return max(found, key=lambda one: abs(one.bias[i]), default=None)
 
 
 def deviations(bound: Floats, unnoticed: Floats, sandwich: Floats, *, fits: bool) -> Floats:

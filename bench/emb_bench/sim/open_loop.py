@@ -152,38 +152,31 @@ def advance_shares(
     the current of another period. ``every`` is a copy of ``chosen``, which changes.
     """
     if late > 0.0:
-        _over(chosen, shares, k, True, every, s)
+        _share_out(chosen, shares, k, True, True, every, s)
         advance(mechanics, p, x, before, late * t_s, every, s)
-        _times(chosen, shares, k, True, s)
-    _over(chosen, shares, k, False, every, s)
+        _share_out(chosen, shares, k, True, False, every, s)
+    _share_out(chosen, shares, k, False, True, every, s)
     advance(mechanics, p, x, u, (1.0 - late) * t_s, every, s)
-    _times(chosen, shares, k, False, s)
+    _share_out(chosen, shares, k, False, False, every, s)
 
 
-def _share(unknown: int, shares: Floats, k: int, j: int, late: bool) -> float:
-    """Share of an unknown in a period; the command before that acts late has its own."""
-    if late and unknown in (K_M, COMMAND):
-        return float(shares[k - 1, j]) if k > 0 else 0.0
-    return float(shares[k, j])
+def _share_out(chosen: Integers, shares: Floats, k: int, late: bool, begins: bool, every: Integers, s: Floats) -> None:
+    """Sensitivities over the shares of a part of a period where it ``begins``, times these where it ends.
 
-
-def _over(chosen: Integers, shares: Floats, k: int, late: bool, every: Integers, s: Floats) -> None:
-    """Sensitivities over the shares of a period."""
+    In the ``late`` part, of the command before, that command and its motor constant have the share of their own period.
+    """
     first = chosen.shape[0] - shares.shape[1]
     for j in range(shares.shape[1]):
-        share = _share(int(chosen[first + j]), shares, k, j, late)
-        every[first + j] = PAST_COMMAND if share == 0.0 else chosen[first + j]
+        unknown, share = int(chosen[first + j]), shares[k, j]
+        if late and unknown in (K_M, COMMAND):
+            share = shares[k - 1, j] if k > 0 else 0.0
+        if begins:
+            every[first + j] = PAST_COMMAND if share == 0.0 else unknown
         for i in range(SENSITIVE):
-            s[first + j, i] /= share if share != 0.0 else 1.0
-
-
-def _times(chosen: Integers, shares: Floats, k: int, late: bool, s: Floats) -> None:
-    """The inverse of :func:`_over`."""
-    first = chosen.shape[0] - shares.shape[1]
-    for j in range(shares.shape[1]):
-        share = _share(int(chosen[first + j]), shares, k, j, late)
-        for i in range(SENSITIVE):
-            s[first + j, i] *= share if share != 0.0 else 1.0
+            if share != 0.0 and begins:
+                s[first + j, i] /= share
+            elif share != 0.0:
+                s[first + j, i] *= share
 
 
 def _carry(x: Floats, s: Floats, k: int) -> None:

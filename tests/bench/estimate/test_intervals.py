@@ -7,12 +7,17 @@ from math import inf
 import numpy as np
 
 from emb_bench.brake.parameters import least
-from emb_bench.estimate.intervals import bounded, deviations, interval, unnoticed
+from emb_bench.estimate.intervals import bounded, deviations, interval, largest, unnoticed
+from emb_bench.estimate.records import Contribution
 
 
 def test_biases_by_several_effects_add_in_quadrature_and_none_is_zero() -> None:
-    assert unnoticed(np.array([[3.0, 0.0], [4.0, 2.0]])).tolist() == [5.0, 2.0]
-    assert unnoticed(np.zeros((0, 2))).tolist() == [0.0, 0.0]
+    budget = [Contribution("drag", (3.0, 0.0)), Contribution("J", (4.0, -2.0))]
+    assert unnoticed(budget, 2).tolist() == [5.0, 2.0]
+    assert unnoticed(budget, 2, ("J",)).tolist() == [3.0, 0.0]
+    assert unnoticed([], 2).tolist() == [0.0, 0.0]
+    assert [largest(budget, 0), largest(budget, 0, ("J",))] == budget[::-1]
+    assert largest(budget, 1, ("J",)) is None
 
 
 def test_deviations_add_an_unnoticed_bias_and_are_no_less_than_the_sandwich_of_a_model_that_does_not_fit() -> None:
