@@ -2,7 +2,7 @@
 
 Times that make no grid, an angle that begins anew and special values are refused, with the row of the file. What
 contradicts the equations of the machine, whatever its friction is, is kept, and named first where the model does not
-fit. Pure: of arrays.
+fit. Pure: of arrays and the map.
 
 The equations are taken over spans of a few samples, as second differences of the angle and of the double integrals of
 what acts: they are exact for any course between the samples, and linear in all that is unknown.
