@@ -198,6 +198,7 @@ class Suspect:
     p_value: float = 1.0  # Chance of as much of it if the model is right
     possible: bool = True  # A brake can have this amount
     observer: Derived | None = None  # What the velocity's lag comes from, if the experiment shows it
+    fall: float = 0.0  # Of χ² with it, to first order; of a term of the clamping force's curve with both terms
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ import numpy as np
 from scipy import special
 
 from emb_bench.brake.motion import Floats
+from emb_bench.brake.parameters import CURVED
 from emb_bench.estimate.average import SHARES, Average, Influence, average, unaveraged
 from emb_bench.estimate.derived_velocity import derived
 from emb_bench.estimate.effects import DRIFTS, EFFECTS, LAGGING, Shown, columns, possible
@@ -82,13 +83,16 @@ def score(
     tested = [i for i, name in enumerate(found.names) if EFFECTS[name].tested and squares[i] > 0.0]
     if not tested:
         return (), budget, None
+    curve = [i for i in tested if found.names[i] in CURVED]
+    both = float(np.sum((basis_and_inverse(found.beside[curve].T)[0].T @ errors) ** 2)) if curve else 0.0
     suspects = []
     for i in tested:
         name, amount, sigmas = found.names[i], float(scores[i] / squares[i]), float(scores[i] / squares[i] ** 0.5)
         away = sigmas / max(ratio, 1.0) ** 0.5
         p = float(special.ndtr(-away) if EFFECTS[name].positive else 2.0 * special.ndtr(-abs(away)))
         low, high = possible(name, problem.bench)
-        suspects.append(Suspect(name, amount, sigmas / max(ratio, 1e-300) ** 0.5, p, possible=low < amount < high))
+        size, fall = sigmas / max(ratio, 1e-300) ** 0.5, both if i in curve else sigmas**2
+        suspects.append(Suspect(name, amount, size, p, possible=low < amount < high, fall=fall))
     together = [i for i in tested if not EFFECTS[found.names[i]].alone]
     axes, values, _ = np.linalg.svd(
         (found.beside[together] / np.sqrt(squares[together])[:, None]).T, full_matrices=False

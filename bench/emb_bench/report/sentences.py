@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
-from emb_bench.brake.parameters import PARAMETERS, UNITS, quantity
+from emb_bench.brake.parameters import CURVED, PARAMETERS, UNITS, quantity
 from emb_bench.experiment.experiment import Experiment, Lack
 from emb_bench.information.identifiability import Border, Doubt, combination
 from emb_bench.numbers import amount, in_samples, p_value, percent
@@ -94,6 +94,7 @@ LACKS = {
 
 LONGEST_NAME = 80  # Characters of a name from another file
 ALIKE = 0.8  # Ratio of the sigmas of two suspects from which on both are about as sure
+DISTINGUISHED = 2.0  # Difference of their squares from which on one is the better
 EXPLAINS = 3.0  # Standard deviations from which on a parameter that is held fixed may explain a misfit
 
 
@@ -323,14 +324,13 @@ def alarms(e: Estimate) -> list[str]:
     if found:
         pass
     elif m.suspected and m.suspected[0].observer:
-        found.append(explained(m.suspected[0], e.bench.machine))
+        found.append(explained(m.suspected[0], m, e.bench.machine))
     elif left := left_fixed(e):
         names = ", ".join(left)
         one = f"{names}, which is held fixed," if len(left) == 1 else f"one of {names}, which are held fixed,"
         found.append(f"{one} may explain it; remedy: estimate {_every(e)}: leave --params out")
-    elif m.suspected:
-        said = explained(_first(m.suspected, e.bench.machine), e.bench.machine)
-        found.append(said + (_window(e) if "--nuisance" in said else ""))
+    elif said := _cause(e):
+        found.append(said)
     elif scored:
         found.append("no effect explains it in an amount that is possible: look for a fault in the data")
     elif m.together is not None and "scores" in m.alarming:
@@ -354,6 +354,39 @@ def alarms(e: Estimate) -> list[str]:
     return found
 
 
+def _cause(e: Estimate) -> str:
+    """The effect that explains a misfit, or the one that explains most of it; empty without a significant one.
+
+    A score test is of first order: where an effect leaves a misfit, its amount says little, not even that a brake
+    cannot have it.
+    """
+    from emb_bench.estimate.effects import LAGGING
+
+    m, machine = e.validation, e.bench.machine
+    found = [s for s in m.suspects if s.name in CURVED or (f"score of {s.name}" in m.alarming and s.name != LAGGING)]
+    if not any(f"score of {s.name}" in m.alarming for s in found):
+        return ""
+    possible = [s for s in found if s.possible or s.name in CURVED]
+    if explaining := [s for s in found if left_by(s, m) <= m.expected[1]]:
+        possible = found = [s for s in possible if s in explaining]
+    if not found:
+        return ""
+    most = max(s.fall for s in found)
+    alike = [s for s in possible if s.fall >= ALIKE**2 * most]
+    best = max(s.fall for s in alike or found) - DISTINGUISHED * m.ratio
+    # A recording is not made again: there an effect that can be estimated is named, if it is as sure.
+    named = [s for s in alike if machine is not None and s.name in PARAMETERS]
+    first = [*named, *(s for s in alike or found if s.fall >= best)][0]
+    said = explained(first, m, machine)
+    said += _window(e) if "--nuisance" in said else ""
+    return said if first in possible else f"{said}; or look for a fault in the data"
+
+
+def left_by(s: Suspect, m: ModelValidation) -> float:
+    """χ²/n that an effect leaves, to first order."""
+    return (m.chi2 - s.fall) / max(m.freedom - 1, 1)
+
+
 def _window(e: Estimate) -> str:
     """Option with which a recording has windows enough for two unknowns more; empty where it has, or has none."""
     from emb_bench.estimate.records import FEWEST_WINDOWS
@@ -363,12 +396,6 @@ def _window(e: Estimate) -> str:
         return ""
     longest = (e.asked.window or machine.window) * e.windows / (needed + 1)
     return f" --window {math.floor(1e3 * longest) / 1e3:g}"
-
-
-def _first(suspected: Sequence[Suspect], machine: Machine | None) -> Suspect:
-    """Suspect that is named: of a recording, which is not made again, one that can be estimated and is as sure."""
-    sure = ALIKE * abs(suspected[0].sigmas) if machine is not None else math.inf
-    return next((s for s in suspected if s.name in PARAMETERS and abs(s.sigmas) >= sure), suspected[0])
 
 
 def faults(e: Estimate) -> list[str]:
@@ -431,21 +458,25 @@ def _coloured(m: ModelValidation) -> str:
     return f"the residuals of the {' and '.join(m.coloured)} are correlated in time (Ljung-Box {tested})"
 
 
-def explained(s: Suspect, machine: Machine | None = None) -> str:
+def explained(s: Suspect, m: ModelValidation, machine: Machine | None = None) -> str:
     """A suspect in words that lead to the remedy; ``machine`` is that of a bench that has no brake."""
     from emb_bench.estimate.effects import EFFECTS, shown_as
 
     if s.observer:
         return derived_velocity(s.observer, machine)
-    effect, unit = EFFECTS[s.name], shown_as(s, machine).unit
-    amount = f"{plain(s.value, 2)} {unit}" if unit else in_percent(s.value)
-    said = effect.effect
+    effect, unit, left = EFFECTS[s.name], shown_as(s, machine).unit, left_by(s, m)
+    said, sigmas = effect.effect, math.sqrt(s.fall / m.ratio)
     for parameter in PARAMETER_NAMES:
         said = said.replace(parameter, quantity(machine, parameter).name)
+    if sigmas**2 - s.sigmas**2 > DISTINGUISHED:  # with the other term of the curve
+        said = "a stiffness with a quadratic and a cubic term"
+    elif s.possible:
+        said += f" of about {plain(s.value, 2)} {unit}" if unit else f" of about {in_percent(s.value)}"
     remedy = effect.remedy
     if machine is not None and "--model" in remedy:  # the plant of a recording is that of its map
         remedy = "leave [signals.velocity] out of the map"
-    return f"{said} of about {amount} explains it ({abs(s.sigmas):.0f} sigma); remedy: {remedy}"
+    whole = "it" if left <= m.expected[1] else f"{percent(min(s.fall / (m.chi2 - m.freedom), 0.999))} of it"
+    return f"{said} explains {whole} ({sigmas:.0f} sigma); remedy: {remedy}"
 
 
 def derived_velocity(observer: Derived, machine: Machine | None) -> str:

@@ -64,7 +64,7 @@ def test_a_parameter_that_drifts_is_named_with_its_size_and_a_remedy(bench: Benc
     assert not m.fits
     assert m.suspected[0].name == f"{name}_drift"
     assert m.suspected[0].value == pytest.approx(SIZES[name], rel=0.3)
-    said = explained(m.suspected[0])
+    said = explained(m.suspected[0], m)
     assert f"a change of {name} over the run of about" in said
     assert "shorter" in said
 
