@@ -20,14 +20,12 @@ from scipy import special
 
 from emb_bench.analysis.several_runs import apart_by
 from emb_bench.estimate.estimate import Estimate
-from emb_bench.experiment.theta import MAX_JSON_BYTES
+from emb_bench.logs.estimates import LONG, read_document
 from emb_runtime.errors import UsageError
-from emb_runtime.system.input_file import read_text
 from emb_runtime.system.terminal import one_line
 
 LEVEL = 0.05  # Chance that anything at all is called a drift where there is none
 SMALLEST = 1e-200  # Smallest value that another one is compared with relatively
-LONG = 80  # Most characters shown of a text in the document
 
 
 class Entry(msgspec.Struct, frozen=True):
@@ -72,10 +70,6 @@ class Earlier(msgspec.Struct, frozen=True):
     records: tuple[Named, ...] = ()
 
 
-class _Report(msgspec.Struct, frozen=True):
-    estimate: Earlier | None = None
-
-
 @dataclass(frozen=True)
 class Drift:
     """One parameter now and then."""
@@ -102,16 +96,9 @@ def read_last(path: Path) -> Earlier:
         UsageError: the file cannot be read, or is no such document.
     """
     try:
-        text = read_text(path, MAX_JSON_BYTES).encode()
-        return msgspec.json.decode(text, type=_Report).estimate or msgspec.json.decode(text, type=Earlier)
+        return read_document(path, Earlier, f"--last {path}")
     except OSError as err:
         raise UsageError(f"--last {path}: {err.strerror}") from err
-    except UnicodeDecodeError as err:
-        raise UsageError(f"--last {path}: expected the JSON of an earlier estimate: not UTF-8 text") from err
-    except (ValueError, msgspec.MsgspecError, RecursionError) as err:
-        raise UsageError(
-            f"--last {path}: expected the JSON of an earlier estimate: {one_line(str(err), LONG)}"
-        ) from err
 
 
 def earlier(e: Estimate, record: str) -> Earlier:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from emb_bench.analysis.options import SearchOptions
 from emb_bench.brake.parameters import SI, UNITS
-from emb_bench.config.bench import Bench, parse_bench
+from emb_bench.config.bench import Bench
 from emb_bench.estimate.records import METHODS
 from emb_bench.options import option
 from emb_bench.output import text_cells
@@ -54,7 +54,7 @@ class CampaignOptions(SearchOptions):
         "FILE",
         kind=Path,
     )
-    bench_text: str | None = None  # Text of the bench file, which other machines do not have; None of each log's own
+    bench_of_all: Bench | None = None  # Content of the bench file, which other machines do not have
 
     def __post_init__(self) -> None:
         """Check all that needs no bench."""
@@ -63,11 +63,6 @@ class CampaignOptions(SearchOptions):
             raise UsageError(f"--chart: expected estimates to draw, and --method is '{NONE}'")
         if not 1e-3 <= self.time_limit <= 1e6:
             raise UsageError(f"--time-limit: expected 0.001 to 1e6 s, got {self.time_limit:g}")
-
-    @property
-    def bench_of_all(self) -> Bench | None:
-        """The bench that all logs are evaluated with; None if each has its own."""
-        return None if self.bench_text is None else parse_bench(self.bench_text, "--bench", analysis=True)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -79,8 +74,9 @@ class CampaignOptions(SearchOptions):
     def origin(self) -> dict[str, Any]:
         """Options that the rows depend on, for the file that has them."""
         params, nuisances = self.names_on(self.bench_of_all)
-        kept = {name: getattr(self, name) for name in ("model", "prior", "bench_text", "starts", "seed")}
-        return {"method": self.method, "params": params, "nuisances": nuisances, **kept}
+        kept = {name: getattr(self, name) for name in ("model", "prior", "starts", "seed")}
+        text = None if self.bench_of_all is None else self.bench_of_all.text
+        return {"method": self.method, "params": params, "nuisances": nuisances, "bench_text": text, **kept}
 
 
 class Column(NamedTuple):

@@ -10,15 +10,11 @@ import msgspec
 from emb_bench.brake.parameters import SI, quantity
 from emb_bench.config.bench import Bench
 from emb_bench.experiment.simulate import NO_ERRORS, SystematicErrors
-from emb_bench.logs.estimates import last_estimate
+from emb_bench.logs.estimates import LOG, last_estimate, read_document
 from emb_bench.logs.log import RunLog
 from emb_bench.sim.simulated_brake import check_near_nominal, parse_assignments, true_parameters
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import LogError, UsageError, near
-from emb_runtime.system.input_file import read_text
-
-LOG = "log"  # Name of the last running estimate in the log
-MAX_JSON_BYTES = 64 * 2**20  # Size limit of the JSON of an estimate or a report
 
 
 def read_theta(
@@ -82,25 +78,17 @@ class _Estimate(msgspec.Struct, frozen=True):
     records: tuple[_Record, ...] = ()
 
 
-class _Report(msgspec.Struct, frozen=True):
-    estimate: _Estimate | None = None
-
-
 def _from_file(path: str, log: RunLog | None, bench: Bench) -> tuple[dict[str, float], SystematicErrors]:
     """Parameters in the document of an estimate or a report [SI], and systematic errors of the log there.
 
     Parameters and systematic errors trade off with each other: only together do they explain the record.
     """
     try:
-        text = read_text(path, MAX_JSON_BYTES).encode()
-        found = msgspec.json.decode(text, type=_Report).estimate or msgspec.json.decode(text, type=_Estimate)
+        found = read_document(path, _Estimate, path)
     except OSError as err:
         hint = near(path, ("log", "nominal", "true"))
         expected = f"expected log, nominal, true, name=value or a file{hint}"
         raise UsageError(f"--theta: {expected}; {path}: {err.strerror}") from err
-    except (ValueError, msgspec.MsgspecError, RecursionError) as err:  # also UnicodeDecodeError
-        wanted = "expected the JSON of 'emb-replay estimate --json' or of a report"
-        raise UsageError(f"{path}: {wanted}: {err}") from err
     names = PARAMETER_NAMES if bench.machine is None else (*PARAMETER_NAMES, "J")
     shown = {name: quantity(bench.machine, name).name for name in names}
     values = {name: _number(found.parameters[own]) for name, own in shown.items() if own in found.parameters}

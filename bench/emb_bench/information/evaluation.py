@@ -18,10 +18,10 @@ from emb_bench.config.plants import DEFAULT_PLANT, RECORDED_PLANT, THESIS_PLANT,
 from emb_bench.documents import ByName
 from emb_bench.experiment.experiment import Experiment, planned
 from emb_bench.experiment.simulate import NO_ERRORS, SystematicErrors, Theta, Trajectory, simulate, simulate_parts
-from emb_bench.experiment.theta import LOG
 from emb_bench.information.fisher import Fisher, Kind, information_over_time, uniform_prior, weights_along
 from emb_bench.information.identifiability import Identifiability, schur_complement
 from emb_bench.information.symmetric import Floats
+from emb_bench.logs.estimates import LOG
 from emb_bench.logs.log import RunLog
 from emb_bench.numbers import relative
 from emb_bench.sim.open_loop import check_unknowns, fast_loop

@@ -22,7 +22,7 @@ from pyarrow import parquet
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import CampaignOptions, Source
 from emb_bench.cli.replay import main
-from emb_bench.config.bench import DRIVEN
+from emb_bench.config.bench import DRIVEN, parse_bench
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
@@ -248,9 +248,9 @@ def test_a_campaign_of_broken_logs_writes_why_and_exits_with_6(
 
 
 def test_a_log_of_another_sample_time_than_the_bench_fails_with_what_is_known_of_it(folder: Path, bench: Bench) -> None:
-    other = bench.text.replace("sample_time = 1.0e-3", "sample_time = 2.0e-3")
+    other = parse_bench(bench.text.replace("sample_time = 1.0e-3", "sample_time = 2.0e-3"), "other", analysis=True)
     path = folder / "monday/a.mcap"
-    row = evaluate_one(Source(str(path), str(folder), "monday/a.mcap", "monday"), CampaignOptions(bench_text=other))
+    row = evaluate_one(Source(str(path), str(folder), "monday/a.mcap", "monday"), CampaignOptions(bench_of_all=other))
     assert row["error"] == f"{path}: expected a sample time of 0.002 s, as in the bench file, got 0.001 s"
     assert row["exit_reason"] == "DONE"
     assert "log_det" not in row
@@ -283,5 +283,6 @@ def test_samples_beyond_a_limit_are_counted(folder: Path, bench: Bench) -> None:
     speeds = np.sort(np.abs(experiment.all_samples[:, 1]))
     limit = f"{0.5 * (speeds[-8] + speeds[-7]):.6f}"
     narrow = re.sub(r"(?m)^velocity = [0-9.e]+( .*rad/s.*)$", f"velocity = {limit}", bench.text, count=1)
-    row = evaluate_one(Source(str(path), "", "a.mcap", "."), CampaignOptions(method="none", bench_text=narrow))
+    options = CampaignOptions(method="none", bench_of_all=parse_bench(narrow, "narrow", analysis=True))
+    row = evaluate_one(Source(str(path), "", "a.mcap", "."), options)
     assert (row["error"], row["violations"]) == (None, 7)
