@@ -23,7 +23,8 @@ from emb_bench.information.evaluation import Evaluation, check_sample_time, defa
 from emb_bench.logs.info import cycle_summary
 from emb_bench.logs.log import RunLog, read_log, require_driven
 from emb_bench.report.caveats import caveats
-from emb_bench.report.sentences import alarms, lacks, warnings
+from emb_bench.report.information import lacks, warnings
+from emb_bench.report.sentences import alarms
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import EmbError, UsageError
 from emb_runtime.system.input_file import open_regular

@@ -24,7 +24,8 @@ from emb_bench.brake.parameters import OF_AN_EXPERIMENT, PARAMETERS, SI, UNITS
 from emb_bench.estimate.records import DONE, NORMAL_95
 from emb_bench.logs.timing import timing
 from emb_bench.numbers import amount, share, share_between
-from emb_bench.report.sentences import doubts, other_model
+from emb_bench.report.information import doubts
+from emb_bench.report.sentences import other_model
 from emb_runtime.config.typed import FieldError, read
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.numbers import between, plain

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from emb_bench.brake.parameters import quantity
 from emb_bench.config.machine import LOADS
-
-if TYPE_CHECKING:  # scipy comes with the extra [bench]
-    from emb_bench.estimate.estimate import Estimate
+from emb_bench.estimate.estimate import Estimate
+from emb_bench.estimate.records import OUTLIER
 
 ON_THE_GRID = 0.01  # Share of a period by which samples may be off the grid without a caveat
 
@@ -24,8 +22,6 @@ def caveats(e: Estimate) -> list[str]:
 
 def _of_losses(e: Estimate) -> Iterator[str]:
     """Outliers, and unknowns that lost reports bring."""
-    from emb_bench.estimate.records import OUTLIER
-
     if apart := sum(experiment.outliers for experiment in e.experiments):
         yield (
             f"{apart} samples lie apart from their neighbours by more than {OUTLIER:g} standard deviations: they are "

@@ -18,6 +18,7 @@ from emb_bench.numbers import p_value, signed
 from emb_bench.report import sentences as say
 from emb_bench.report import tables
 from emb_bench.report.caveats import caveats
+from emb_bench.report.information import directions, doubts, trade_offs
 from emb_bench.report.text import Table, facts, listed, wrapped
 from emb_runtime.numbers import plain
 
@@ -75,7 +76,7 @@ def _remarks(study: Study, *, trades: bool) -> Iterator[str]:
     """Doubts and changes of parameters, and their ``trades``-off, each with all parameters that it holds for."""
     said: dict[str, list[str]] = {}
     for c in study.conclusions:
-        remarks = [say.doubts(c.finding), say.trade_offs(c.finding) if trades else ""]
+        remarks = [doubts(c.finding), trade_offs(c.finding) if trades else ""]
         remarks += [say.drift(c.drift)] if c.drift is not None else []
         if text := "; ".join(filter(None, remarks)):
             said.setdefault(text, []).append(c.label)
@@ -138,7 +139,7 @@ def _evidence(study: Study) -> Iterator[str]:
     for table in found:
         yield from [] if table is None else table.text("  ")
     yield from listed("NOTE: ", [say.pairs(pairs) if pairs else "", say.once(study)])
-    yield from listed("", say.directions(e.verdict()))
+    yield from listed("", directions(e.verdict()))
     yield from listed("", (f"profile of {p.label}: {say.profile(p, e)}" for p in study.checks.profiles))
 
 

@@ -14,7 +14,7 @@ from emb_bench.information.criteria import criteria_series
 from emb_bench.information.evaluation import KINDS, Evaluation, Question, default_model, evenly
 from emb_bench.information.identifiability import combination
 from emb_bench.numbers import in_samples, relative
-from emb_bench.report import sentences as say
+from emb_bench.report import information as say
 from emb_bench.report.text import Table, facts, listed, wrapped
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import EmbError, needs

@@ -25,6 +25,7 @@ from emb_bench.report import sentences as say
 from emb_bench.report.acceptance import Acceptance
 from emb_bench.report.caveats import caveats
 from emb_bench.report.estimate import document as estimate_document
+from emb_bench.report.information import lacks, taken_for_acted
 from emb_bench.report.motion import REASONS, Motion
 from emb_bench.report.page import (
     LONGEST,
@@ -518,7 +519,7 @@ def _log(run: Run) -> Iterator[Block]:
     """The log's file, end, metadata and attachments."""
     log, x = run.log, run.experiment
     missing = [log.missing] if log.missing else []
-    missing += [] if x is None else say.lacks(x)
+    missing += [] if x is None else lacks(x)
     whole = Cell("complete: closed properly, every checksum right", "good")
     rows: list[tuple[str, Words]] = [
         ("file", Cell(str(log.path), "code")),
@@ -657,8 +658,8 @@ def _run_document(run: Run, study: Study) -> dict[str, Any]:
         found["experiment"] = {
             "planned": x.quality.planned,
             "command_delay": x.quality.command_delay,
-            "missing": say.lacks(x),
-            "notes": say.taken_for_acted(x),
+            "missing": lacks(x),
+            "notes": taken_for_acted(x),
             "periods": len(x.currents),
             "measured": x.measured.sum(),
             "braked_periods": x.quality.braked,

@@ -4,30 +4,37 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Collection, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
-from emb_bench.brake.parameters import CURVED, PARAMETERS, UNITS, quantity
-from emb_bench.experiment.experiment import Experiment, Lack
-from emb_bench.information.identifiability import Border, Doubt, combination
-from emb_bench.numbers import amount, in_samples, p_value, percent
+from emb_bench.analysis.conclusion import Conclusion
+from emb_bench.analysis.drift import Drift, Earlier
+from emb_bench.analysis.options import known_values
+from emb_bench.analysis.records import Candidate, HeldOut, Profile
+from emb_bench.analysis.study import Code, Stop, Study, verdict
+from emb_bench.brake.parameters import CURVED, PARAMETERS, quantity
+from emb_bench.config.bench import Bench
+from emb_bench.config.machine import Machine
+from emb_bench.estimate.effects import EFFECTS, LAGGING, shown_as
+from emb_bench.estimate.estimate import OF_THE_BENCH, Estimate
+from emb_bench.estimate.records import (
+    DONE,
+    FEWEST_WINDOWS,
+    WITHOUT_GAPS,
+    Contribution,
+    Derived,
+    ModelValidation,
+    Suspect,
+)
+from emb_bench.experiment.experiment import Lack
+from emb_bench.information.evaluation import default_model
+from emb_bench.information.identifiability import Doubt
+from emb_bench.logs.log import RunLog
+from emb_bench.numbers import amount, p_value, percent
+from emb_bench.report.information import DOUBTS, doubts, lacks, taken_for_acted, trade_offs
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.estimator.estimate import NORMAL_95
 from emb_runtime.numbers import between, in_percent, plain
 from emb_runtime.system.terminal import one_line
-
-if TYPE_CHECKING:  # scipy comes with the extra [bench]
-    from emb_bench.analysis.conclusion import Conclusion
-    from emb_bench.analysis.drift import Drift, Earlier
-    from emb_bench.analysis.records import Candidate, HeldOut, Profile
-    from emb_bench.analysis.study import Stop, Study
-    from emb_bench.config.bench import Bench
-    from emb_bench.config.machine import Machine
-    from emb_bench.estimate.estimate import Estimate
-    from emb_bench.estimate.records import Contribution, Derived, ModelValidation, Suspect
-    from emb_bench.information.evaluation import Evaluation
-    from emb_bench.information.identifiability import Direction, Finding, Identifiability
-    from emb_bench.logs.log import RunLog
 
 INTERVALS = (
     "± 95 % (k=2). Repeatability: scatter of further runs by sensor noise. Total: also systematic errors and effects "
@@ -47,50 +54,6 @@ TERMS = {
 }
 """Terms of the results, each explained in a line."""
 
-DOUBTS = {
-    Doubt.NO_INFORMATION: "no effect on the record",
-    Doubt.ONLY_COMBINED: "only in combination with others",
-    Doubt.NOTHING_NEW: "the record adds nothing to what was known before",
-    Doubt.TOO_WIDE: "the best possible interval is as large as the value or a gross error",
-    Doubt.FLAT: "no value within the search is excluded",
-    Doubt.OPEN_BELOW: "only values above the interval are excluded",
-    Doubt.OPEN_ABOVE: "only values below the interval are excluded",
-    Doubt.CUT: "the interval ends where another parameter is at the border of its search",
-    Doubt.AT_BORDER: "the value is AT THE BORDER of the search",
-    Doubt.CONTAINS_ZERO: "the interval contains zero",
-}
-"""Reasons that a parameter is not identified."""
-
-BORDERS = {
-    Border.BELOW: "outside its range, beyond the lower border",
-    Border.AT_LOWER: "at the lower border of its range",
-    Border.AT_UPPER: "at the upper border of its range",
-    Border.ABOVE: "outside its range, beyond the upper border",
-}
-"""Places of a value at, or beyond, a border of its range."""
-
-
-LACKS = {
-    Lack.ENDS_EARLY: "the experiment ends after {} of {} samples",
-    Lack.LOST: "{} samples were lost: they count for no information, and what acted in the periods before them was not "
-    "reported",
-    Lack.LOST_WITH_CHARGE: "{} samples were lost: they count for no information, and what acted in the periods before "
-    "them was not reported; the charge gives it for {} periods",
-    Lack.CONTRADICTED: "in {} periods the node reports another current than the command says",
-    Lack.NO_COUNTERS: "the recording has no counters, answers or states: a repeated, late or lost command cannot be "
-    "told",
-    Lack.NO_VELOCITY: "the recording has no velocity: an observer ({:g} rad/s) derives one from the angles, which has "
-    "no weight in an estimate",
-    Lack.NO_CURRENT: "the recording has no measured current: what acted is taken to be what was commanded",
-    Lack.NO_COMMANDS: "the recording has no commands: what acted is the mean of the measured current over each period",
-    Lack.NO_TIMES: "the recording has no times: its rows are taken to be one sample time apart",
-    Lack.LOST_OF_RECORDING: "{} samples are lost: what acted in the periods before them is not known to have acted",
-    Lack.HEAD: "line {} of the file is taken for its head, and the lines before it are left out",
-    Lack.OTHER_FRAMES: "{} frames were skipped, of {} identifiers that the map does not name",
-    Lack.BAD_FRAMES: "{} frames do not fit the DBC and were skipped",
-}
-"""Parts of an experiment that are missing, with places for their numbers."""
-
 
 LONGEST_NAME = 80  # Characters of a name from another file
 ALIKE = 0.8  # Ratio of the sigmas of two suspects from which on both are about as sure
@@ -100,30 +63,7 @@ EXPLAINS = 3.0  # Standard deviations from which on a parameter that is held fix
 
 def without(study: Study) -> str:
     """Kind of the intervals of a model that does not hold, and the error that is not in them."""
-    from emb_bench.analysis.study import verdict
-
     return f"± total (95 %, k=2), without the {'bias of the method' if verdict(study).biased else 'error of the model'}"
-
-
-# ---- an experiment ----
-
-
-def lacks(x: Experiment, but: Collection[Lack] = ()) -> list[str]:
-    """Parts of an experiment that are missing, or not to be trusted."""
-    return [LACKS[lack].format(*numbers) for lack, numbers in x.quality.lacks.items() if lack not in but]
-
-
-def taken_for_acted(x: Experiment) -> list[str]:
-    """The currents that were taken for those that acted, where these are not the reported ones."""
-    q = x.quality
-    if q.within is None:
-        return []
-    if math.isnan(q.within):
-        return ["the drive's mapping is not readable: what acted is taken to be what the drive reported"]
-    return [
-        f"what acted is taken to be the command as its bus carried it, {in_samples(q.command_delay)} late, where what "
-        f"the drive reported lies within {q.within:.3g} A of it, and elsewhere what the drive reported"
-    ]
 
 
 def intervals(e: Estimate) -> str:
@@ -135,11 +75,7 @@ def intervals(e: Estimate) -> str:
 
 def effects(machine: Machine | None) -> dict[str, str]:
     """Effects of the score tests and of the uncertainty budget by the names that are shown, each in a line."""
-    from emb_bench.estimate.effects import EFFECTS, SCALES, shown_as
-    from emb_bench.estimate.records import Contribution
-
     said = {name: row.effect.removesuffix(",") for name, row in EFFECTS.items()}
-    said |= {name: f"an error of the {name.removesuffix('_scale')}'s scale" for name in SCALES}
     for parameter in PARAMETER_NAMES:
         for name in (parameter, f"{parameter}_drift"):
             said[name] = said[name].replace(parameter, quantity(machine, parameter).name)
@@ -162,8 +98,6 @@ def simulated(logs: Sequence[RunLog], names: Sequence[str]) -> str:
 
 def headline(study: Study) -> str:
     """Verdict on the model, and the worth of its values."""
-    from emb_bench.analysis.study import Code, verdict
-
     code = verdict(study).model
     if code is Code.NO_ESTIMATE:
         return f"NO ESTIMATE: {study.why_not}"
@@ -191,8 +125,6 @@ ONLY_ALONE = (
 
 def compared(study: Study) -> str:
     """Verdict on each of two runs side by side, and the parameters in which they differ."""
-    from emb_bench.analysis.study import verdict
-
     studies = [run.alone for run in study.runs if run.alone is not None]
     changes = [d for d in studies[1].checks.drifts if d.drifted]
     differ = "; ".join(f"{d.name} {drift(d)}" for d in changes) or "No parameter differs significantly"
@@ -248,8 +180,6 @@ def other_model(now: Estimate, last: Earlier | None) -> str:
 
 def missing(study: Study) -> list[str]:
     """Defects of the logs; that a stopped run ended early is not repeated."""
-    from emb_bench.estimate.records import DONE, WITHOUT_GAPS
-
     found = []
     for log, experiment in zip(study.logs, study.estimate.experiments, strict=True):
         said = [log.missing] if log.missing else []
@@ -279,8 +209,6 @@ def _of_which(study: Study, found: Sequence[Sequence[str]]) -> list[str]:
 
 def model_reason(study: Study) -> str:
     """Reason for the model."""
-    from emb_bench.information.evaluation import default_model
-
     choice = study.checks.choice
     if choice is None:
         return "asked for" if study.options.model else default_model(study.logs[0])[1]
@@ -307,9 +235,6 @@ def models(study: Study) -> str:
 
 def limit(effect: Contribution, e: Estimate) -> str:
     """Effect that limits an interval most, with the prior of one that all runs share."""
-    from emb_bench.estimate.effects import shown_as
-    from emb_bench.estimate.estimate import OF_THE_BENCH
-
     name, shared = shown_as(effect, e.bench.machine).name, effect.name in OF_THE_BENCH
     return f"{name}, known to {in_percent(e.asked.allowed[effect.name])}" if shared else name
 
@@ -360,8 +285,6 @@ def _cause(e: Estimate) -> str:
     A score test is of first order: where an effect leaves a misfit, its amount says little, not even that a brake
     cannot have it.
     """
-    from emb_bench.estimate.effects import LAGGING
-
     m, machine = e.validation, e.bench.machine
     found = [s for s in m.suspects if s.name in CURVED or (f"score of {s.name}" in m.alarming and s.name != LAGGING)]
     if not any(f"score of {s.name}" in m.alarming for s in found):
@@ -389,8 +312,6 @@ def left_by(s: Suspect, m: ModelValidation) -> float:
 
 def _window(e: Estimate) -> str:
     """Option with which a recording has windows enough for two unknowns more; empty where it has, or has none."""
-    from emb_bench.estimate.records import FEWEST_WINDOWS
-
     machine, needed = e.bench.machine, FEWEST_WINDOWS * (len(e.unknowns) + 2)
     if machine is None or not 0 < e.windows < needed:
         return ""
@@ -460,8 +381,6 @@ def _coloured(m: ModelValidation) -> str:
 
 def explained(s: Suspect, m: ModelValidation, machine: Machine | None = None) -> str:
     """A suspect in words that lead to the remedy; ``machine`` is that of a bench that has no brake."""
-    from emb_bench.estimate.effects import EFFECTS, shown_as
-
     if s.observer:
         return derived_velocity(s.observer, machine)
     effect, unit, left = EFFECTS[s.name], shown_as(s, machine).unit, left_by(s, m)
@@ -511,17 +430,6 @@ def clamping(study: Study) -> str:
         f"clamping    force known to {known}: {amount(*force.shown)} at {plain(found.angle)} rad, held by "
         f"{amount(*current.shown)}; friction band ± {plain(friction.value)} N, known to {band}"
     )
-
-
-def doubts(f: Finding) -> str:
-    """Reasons that a parameter is not identified; empty if it is."""
-    return "; ".join(DOUBTS[doubt] for doubt in f.doubts)
-
-
-def trade_offs(f: Finding) -> str:
-    """Parameters whose errors compensate one of this parameter, with the correlations; empty without any."""
-    others = ", ".join(f"{name} (correlation {plain(correlation, 4)})" for name, correlation in f.traded_with.items())
-    return f"trades off with {others}" if others else ""
 
 
 def drift(d: Drift) -> str:
@@ -613,8 +521,6 @@ def remedies(study: Study, *, stopped: bool) -> list[str]:
 
     Where a run was ``stopped`` no further one is named: its cause comes first.
     """
-    from emb_bench.analysis.study import verdict
-
     e, again = study.estimate, f"emb-replay estimate {logs_of(study)}{_known(study)}"
     if verdict(study).biased:
         return [f"use another method: {again} --method oem"]
@@ -646,8 +552,6 @@ def remedies(study: Study, *, stopped: bool) -> list[str]:
 
 def _known(study: Study) -> str:
     """The option of a study for parameters that are known beforehand."""
-    from emb_bench.analysis.options import known_values
-
     known = known_values(study.options.known).items()
     said = ",".join(f"{name}={value:.6g}±{NORMAL_95 * deviation:.3g}" for name, (value, deviation) in known)
     return f" --known {said}" if said else ""
@@ -668,79 +572,3 @@ def impact(bench: Bench, speed: float | None, why_not: str) -> str:
     if speed == 0.0:
         return f"{how}, and no brake of the set '{bench.shield.ranges}' reaches an end stop"
     return f"{how}, and a brake of the set may hit an end stop with {plain(speed, 3)} rad/s"
-
-
-# ---- Fisher information ----
-
-
-def warnings(e: Evaluation) -> list[str]:
-    """Reasons to doubt an information."""
-    found = [text for text in (e.log.missing, *lacks(e.experiment)) if text]
-    late, expected = e.experiment.quality.command_delay, e.plant.instruments.command_delay
-    if late != expected:
-        found.append(
-            f"commands acted {in_samples(late)} late, in the model '{e.plant.name}' {in_samples(expected)}: the "
-            "currents are those of the log"
-        )
-    if e.absent:
-        found.append(
-            f"{', '.join(e.absent)} is zero in the model '{e.plant.name}': the data say nothing about it; use a model "
-            "that has it"
-        )
-    if e.fit.fits:
-        return found
-    if e.log.is_recording:
-        why = (
-            "theta is a guess of the map: pass --theta with an estimate"
-            if e.theta_name == "nominal"
-            else "the model does not include what disturbed the machine"
-        )
-    elif e.log.missing or e.experiment.quality.lacks:
-        why = "what is missing hides whether theta is right"
-    else:
-        why = "pass --theta or --model"
-    worst = max(e.fit.compared)
-    return [
-        *found,
-        f"model '{e.plant.name}' with theta of '{e.theta_name}' does not fit (rms {plain(worst)} sigma): {why}",
-    ]
-
-
-def notes(e: Evaluation) -> list[str]:
-    """Assumptions about the currents that acted, and effects of the model's instruments."""
-    instruments, found = e.plant.instruments, taken_for_acted(e.experiment)
-    if known := {name: value for name, value in e.errors._asdict().items() if value}:
-        values = ", ".join(f"{n} = {plain(v)} {UNITS[n]}".removesuffix(" 1") for n, v in known.items())
-        found.append(f"systematic errors of this record, from {e.theta_name}, are taken as known: {values}")
-    if instruments.observer_bandwidth > 0.0:
-        found.append("the velocity is an observer's and adds no physical information")
-    if instruments.clock_jitter > 0.0:
-        found.append(
-            "a sigma includes the motion during the clock's jitter; angle and velocity of a sample count as "
-            "independent, so bounds are right to a percent up to 20 µs"
-        )
-    if instruments.measurement_delay > 0:
-        found.append(f"samples show the brake {in_samples(instruments.measurement_delay)} earlier")
-    if instruments.encoder_offset != 0.0 and e.errors.offset is None:
-        found.append(f"the encoder is assumed to show {instruments.encoder_offset:g} rad at the origin")
-    return found
-
-
-def finding(f: Finding) -> str:
-    """Identifiability of one parameter."""
-    verdict = "identified" if f.identified else f"NOT identified: {doubts(f)}"
-    border = "" if f.border is None else BORDERS[f.border]
-    return "; ".join(filter(None, (verdict, trade_offs(f), border)))
-
-
-def direction(d: Direction) -> str:
-    """A combination of parameters that the data do not identify."""
-    if math.isinf(d.deviation):
-        return f"no information on {combination(d.shares)}"
-    return f"hardly any information on {combination(d.shares)}: known to {plain(d.deviation)} times its size"
-
-
-def directions(found: Identifiability) -> list[str]:
-    """Combinations that are not identified, or by the prior alone."""
-    lines = [direction(d) for d in found.directions]
-    return lines + [f"from the prior alone: {combination(shares)}" for shares in found.left_to_prior]

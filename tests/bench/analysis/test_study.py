@@ -27,7 +27,8 @@ from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.identifiability import Doubt
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.report.estimate import document, text
-from emb_bench.report.sentences import DOUBTS, alarms, apart, remedies
+from emb_bench.report.information import DOUBTS
+from emb_bench.report.sentences import alarms, apart, remedies
 from emb_bench.report.sentences import profile as sentence
 from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.errors import UsageError

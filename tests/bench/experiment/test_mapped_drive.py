@@ -16,7 +16,8 @@ from emb_bench.information.evaluation import Evaluation
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.numbers import in_samples
 from emb_bench.report import estimate as report
-from emb_bench.report.sentences import assumptions, notes
+from emb_bench.report.information import notes
+from emb_bench.report.sentences import assumptions
 from emb_runtime.cli.main import main
 from emb_runtime.config.bench import PARAMETER_NAMES, parse_bench
 from emb_runtime.records import Frame

@@ -1,0 +1,158 @@
+"""Sentences on a record and on its Fisher information; base install only."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+
+from emb_bench.brake.parameters import UNITS
+from emb_bench.experiment.experiment import Experiment, Lack
+from emb_bench.information.evaluation import Evaluation
+from emb_bench.information.identifiability import Border, Direction, Doubt, Finding, Identifiability, combination
+from emb_bench.numbers import in_samples
+from emb_runtime.numbers import plain
+
+DOUBTS = {
+    Doubt.NO_INFORMATION: "no effect on the record",
+    Doubt.ONLY_COMBINED: "only in combination with others",
+    Doubt.NOTHING_NEW: "the record adds nothing to what was known before",
+    Doubt.TOO_WIDE: "the best possible interval is as large as the value or a gross error",
+    Doubt.FLAT: "no value within the search is excluded",
+    Doubt.OPEN_BELOW: "only values above the interval are excluded",
+    Doubt.OPEN_ABOVE: "only values below the interval are excluded",
+    Doubt.CUT: "the interval ends where another parameter is at the border of its search",
+    Doubt.AT_BORDER: "the value is AT THE BORDER of the search",
+    Doubt.CONTAINS_ZERO: "the interval contains zero",
+}
+"""Reasons that a parameter is not identified."""
+
+BORDERS = {
+    Border.BELOW: "outside its range, beyond the lower border",
+    Border.AT_LOWER: "at the lower border of its range",
+    Border.AT_UPPER: "at the upper border of its range",
+    Border.ABOVE: "outside its range, beyond the upper border",
+}
+"""Places of a value at, or beyond, a border of its range."""
+
+LACKS = {
+    Lack.ENDS_EARLY: "the experiment ends after {} of {} samples",
+    Lack.LOST: "{} samples were lost: they count for no information, and what acted in the periods before them was not "
+    "reported",
+    Lack.LOST_WITH_CHARGE: "{} samples were lost: they count for no information, and what acted in the periods before "
+    "them was not reported; the charge gives it for {} periods",
+    Lack.CONTRADICTED: "in {} periods the node reports another current than the command says",
+    Lack.NO_COUNTERS: "the recording has no counters, answers or states: a repeated, late or lost command cannot be "
+    "told",
+    Lack.NO_VELOCITY: "the recording has no velocity: an observer ({:g} rad/s) derives one from the angles, which has "
+    "no weight in an estimate",
+    Lack.NO_CURRENT: "the recording has no measured current: what acted is taken to be what was commanded",
+    Lack.NO_COMMANDS: "the recording has no commands: what acted is the mean of the measured current over each period",
+    Lack.NO_TIMES: "the recording has no times: its rows are taken to be one sample time apart",
+    Lack.LOST_OF_RECORDING: "{} samples are lost: what acted in the periods before them is not known to have acted",
+    Lack.HEAD: "line {} of the file is taken for its head, and the lines before it are left out",
+    Lack.OTHER_FRAMES: "{} frames were skipped, of {} identifiers that the map does not name",
+    Lack.BAD_FRAMES: "{} frames do not fit the DBC and were skipped",
+}
+"""Parts of an experiment that are missing, with places for their numbers."""
+
+
+def lacks(x: Experiment, but: Collection[Lack] = ()) -> list[str]:
+    """Parts of an experiment that are missing, or not to be trusted."""
+    return [LACKS[lack].format(*numbers) for lack, numbers in x.quality.lacks.items() if lack not in but]
+
+
+def taken_for_acted(x: Experiment) -> list[str]:
+    """The currents that were taken for those that acted, where these are not the reported ones."""
+    q = x.quality
+    if q.within is None:
+        return []
+    if math.isnan(q.within):
+        return ["the drive's mapping is not readable: what acted is taken to be what the drive reported"]
+    return [
+        f"what acted is taken to be the command as its bus carried it, {in_samples(q.command_delay)} late, where what "
+        f"the drive reported lies within {q.within:.3g} A of it, and elsewhere what the drive reported"
+    ]
+
+
+def doubts(f: Finding) -> str:
+    """Reasons that a parameter is not identified; empty if it is."""
+    return "; ".join(DOUBTS[doubt] for doubt in f.doubts)
+
+
+def trade_offs(f: Finding) -> str:
+    """Parameters whose errors compensate one of this parameter, with the correlations; empty without any."""
+    others = ", ".join(f"{name} (correlation {plain(correlation, 4)})" for name, correlation in f.traded_with.items())
+    return f"trades off with {others}" if others else ""
+
+
+def finding(f: Finding) -> str:
+    """Identifiability of one parameter."""
+    verdict = "identified" if f.identified else f"NOT identified: {doubts(f)}"
+    border = "" if f.border is None else BORDERS[f.border]
+    return "; ".join(filter(None, (verdict, trade_offs(f), border)))
+
+
+def direction(d: Direction) -> str:
+    """A combination of parameters that the data do not identify."""
+    if math.isinf(d.deviation):
+        return f"no information on {combination(d.shares)}"
+    return f"hardly any information on {combination(d.shares)}: known to {plain(d.deviation)} times its size"
+
+
+def directions(found: Identifiability) -> list[str]:
+    """Combinations that are not identified, or by the prior alone."""
+    lines = [direction(d) for d in found.directions]
+    return lines + [f"from the prior alone: {combination(shares)}" for shares in found.left_to_prior]
+
+
+def warnings(e: Evaluation) -> list[str]:
+    """Reasons to doubt an information."""
+    found = [text for text in (e.log.missing, *lacks(e.experiment)) if text]
+    late, expected = e.experiment.quality.command_delay, e.plant.instruments.command_delay
+    if late != expected:
+        found.append(
+            f"commands acted {in_samples(late)} late, in the model '{e.plant.name}' {in_samples(expected)}: the "
+            "currents are those of the log"
+        )
+    if e.absent:
+        found.append(
+            f"{', '.join(e.absent)} is zero in the model '{e.plant.name}': the data say nothing about it; use a model "
+            "that has it"
+        )
+    if e.fit.fits:
+        return found
+    if e.log.is_recording:
+        why = (
+            "theta is a guess of the map: pass --theta with an estimate"
+            if e.theta_name == "nominal"
+            else "the model does not include what disturbed the machine"
+        )
+    elif e.log.missing or e.experiment.quality.lacks:
+        why = "what is missing hides whether theta is right"
+    else:
+        why = "pass --theta or --model"
+    worst = max(e.fit.compared)
+    return [
+        *found,
+        f"model '{e.plant.name}' with theta of '{e.theta_name}' does not fit (rms {plain(worst)} sigma): {why}",
+    ]
+
+
+def notes(e: Evaluation) -> list[str]:
+    """Assumptions about the currents that acted, and effects of the model's instruments."""
+    instruments, found = e.plant.instruments, taken_for_acted(e.experiment)
+    if known := {name: value for name, value in e.errors._asdict().items() if value}:
+        values = ", ".join(f"{n} = {plain(v)} {UNITS[n]}".removesuffix(" 1") for n, v in known.items())
+        found.append(f"systematic errors of this record, from {e.theta_name}, are taken as known: {values}")
+    if instruments.observer_bandwidth > 0.0:
+        found.append("the velocity is an observer's and adds no physical information")
+    if instruments.clock_jitter > 0.0:
+        found.append(
+            "a sigma includes the motion during the clock's jitter; angle and velocity of a sample count as "
+            "independent, so bounds are right to a percent up to 20 µs"
+        )
+    if instruments.measurement_delay > 0:
+        found.append(f"samples show the brake {in_samples(instruments.measurement_delay)} earlier")
+    if instruments.encoder_offset != 0.0 and e.errors.offset is None:
+        found.append(f"the encoder is assumed to show {instruments.encoder_offset:g} rad at the origin")
+    return found
