@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 from html import escape
 from typing import Any, Literal, NamedTuple
 
@@ -22,6 +24,7 @@ from emb_bench.estimate.records import DONE, SAME, End
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.figures import for_notebook
 from emb_bench.logs.log import RunLog, end_detail
+from emb_bench.logs.timing import Timing, timing
 from emb_bench.numbers import amount
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import LogError, needs
@@ -55,6 +58,19 @@ class Run:
     experiment: Experiment | None  # None if the log has none
     why_not: str = ""  # Reason that it has no part in the estimate; empty if it has
     alone: Study | None = None  # Study of this run by itself, where a report has several
+
+    @cached_property
+    def timing(self) -> Timing | None:
+        """Timing of its loop; None if the log has no control cycles."""
+        with suppress(LogError):
+            return timing(self.log)
+        return None
+
+    @property
+    def lost(self) -> float | None:
+        """Share of the samples that are not in the log; None without an experiment."""
+        x = self.experiment
+        return None if x is None or x.quality.planned == 0 else 1.0 - int(x.measured.sum()) / max(len(x.measured), 1)
 
     @property
     def stop(self) -> Stop | None:
@@ -222,20 +238,31 @@ class Study:
         return tuple(run for run in self.runs if not run.why_not)
 
     @property
+    def reported(self) -> tuple[Run, ...]:
+        """The runs of the estimate, or all where there is none."""
+        return self.used or self.runs
+
+    @property
     def logs(self) -> tuple[RunLog, ...]:
         """The logs of the estimate, in the order of its experiments."""
         return tuple(run.log for run in self.used)
 
     @property
     def names(self) -> list[str]:
-        """Names to show for the runs of the estimate, or for all where there is none."""
-        return [run.name for run in self.used or self.runs]
+        """Names to show for the runs that are reported."""
+        return [run.name for run in self.reported]
 
     @property
     def truth(self) -> BrakeParameters | None:
         """Parameters of the simulated brake, if known and the same in all logs."""
         truths = {log.truth for log in self.logs}
         return truths.pop() if len(truths) == 1 else None
+
+    @property
+    def side_by_side(self) -> list[Study]:
+        """The studies of runs that are each estimated alone; empty where there is a joint estimate, or none."""
+        alone = [run.alone for run in self.runs if run.alone is not None]
+        return alone if self.joint is None and len(alone) == len(self.runs) else []
 
     @property
     def stops(self) -> list[Stop]:
@@ -352,12 +379,16 @@ MODEL_VERDICTS: tuple[tuple[Code, Tone, Held], ...] = (
 def verdict(study: Study, accepted: Result | None = None) -> Verdict:
     """The most severe verdict that holds; ``accepted`` is the result of acceptance criteria, if there are any.
 
-    A brake outside of the shield's ranges is never good, nor is a simulated one, or a log that lacks something.
+    A brake outside of the shield's ranges is never good, nor is a simulated one, or a log that lacks something. Of runs
+    side by side it is the worse one.
     """
+    if study.side_by_side:
+        found = [verdict(own, accepted) for own in study.side_by_side]
+        return min(found, key=lambda one: list(Code).index(one.code))
     model, tone = next((code, tone) for code, tone, held in MODEL_VERDICTS if held(study, accepted))
     code, tone = next(((code, tone) for code, tone, held in VERDICTS if held(study, accepted)), (model, tone))
     if study.outside:
         tone = "bad"
-    elif tone == "good" and any(run.log.simulated or not run.log.complete for run in study.used or study.runs):
+    elif tone == "good" and any(run.log.simulated or not run.log.complete for run in study.reported):
         tone = "care"
     return Verdict(code, tone, model)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -113,11 +112,14 @@ def report(
         made_by = f"emb-excite {metadata.version('emb-excite')}"
         if asked.compare and left_out:
             raise LogError("--compare: " + "; ".join(f"{path}: {why}" for path, why in left_out))
-        compare, joint = side_by_side, partial(make_study, last=before, for_report=True)
-        study = (compare if asked.compare else joint)(its, logs, asked)
+        if asked.compare:
+            study = side_by_side(its, logs, asked)
+        else:
+            study = make_study(its, logs, asked, last=before, for_report=True)
         made = Report(study, its, left_out, made_by)
-        if criteria is not None:
-            made = replace(made, acceptance=test.judge(criteria, study, made.without_part))
+        if criteria is not None and asked.acceptance is not None:
+            accepted = test.judge(criteria, Path(asked.acceptance).name, study, made.without_part)
+            made = replace(made, acceptance=accepted)
         new_numbers.write_text(json_document(document(made)) + "\n", encoding="utf-8")
         new_page.write_text(html(page_of(made)), encoding="utf-8")
         if asked.junit is not None and made.acceptance is not None:

@@ -70,8 +70,9 @@ def _exit_code(study: Study, accepted: Result | None = None, *, strict: bool) ->
     from emb_bench.analysis.study import Code, verdict
 
     if not strict:
-        recorded = study.joint is not None and study.joint.bench.machine is not None
-        return EXIT_CHECK_FAILED if recorded and not study.model_fits else EXIT_DONE
+        estimates = [own.joint for own in study.side_by_side or [study] if own.joint is not None]
+        misfits = [e for e in estimates if e.bench.machine is not None and not e.validation.fits]
+        return EXIT_CHECK_FAILED if misfits else EXIT_DONE
     fits = EXIT_OUTSIDE if study.outside else EXIT_DONE
     codes = {Code.FITS: fits, Code.ACCEPTED: EXIT_DONE, Code.UNDECIDED: EXIT_CANNOT_TELL}
     return codes.get(verdict(study, accepted).code, EXIT_CHECK_FAILED)
@@ -89,8 +90,7 @@ def _report(args: argparse.Namespace) -> int:
     if made.without_part:
         return EXIT_CHECK_FAILED
     accepted = None if made.acceptance is None else made.acceptance.result
-    codes = {_exit_code(study, accepted, strict=args.strict) for study in made.studies}
-    return EXIT_CHECK_FAILED if EXIT_CHECK_FAILED in codes else max(codes)
+    return _exit_code(made.study, accepted, strict=args.strict)
 
 
 def _export(args: argparse.Namespace) -> int:

@@ -22,12 +22,11 @@ from emb_bench.analysis.drift import Drift
 from emb_bench.analysis.study import Code, Result, Run, Study, verdict
 from emb_bench.brake.parameters import OF_AN_EXPERIMENT, PARAMETERS, SI, UNITS
 from emb_bench.estimate.records import DONE, NORMAL_95
-from emb_bench.logs.timing import timing
 from emb_bench.numbers import amount, share, share_between
 from emb_bench.report.information import doubts
 from emb_bench.report.sentences import other_model
 from emb_runtime.config.typed import FieldError, read
-from emb_runtime.errors import LogError, UsageError
+from emb_runtime.errors import UsageError
 from emb_runtime.numbers import between, plain
 from emb_runtime.system.input_file import read_text
 
@@ -62,7 +61,7 @@ class Budgets(msgspec.Struct, frozen=True):
     lost: Share | None = None  # Of samples that are not in the log
 
 
-class Table(msgspec.Struct, frozen=True):
+class Criteria(msgspec.Struct, frozen=True):
     """Content of an acceptance file."""
 
     model_fit: bool = True  # The model has to fit the records, and to predict what it was not fitted to
@@ -82,12 +81,6 @@ class Table(msgspec.Struct, frozen=True):
                 raise FieldError(f"parameters.{name}", "expected interval = [low, high]: it has no size to share")
 
 
-class Criteria(Table, frozen=True):
-    """An acceptance file."""
-
-    source: str = ""  # Name of the file
-
-
 @dataclass(frozen=True)
 class Criterion:
     """One criterion and its result."""
@@ -103,7 +96,7 @@ class Criterion:
 class Acceptance:
     """All criteria with their results."""
 
-    criteria: Criteria
+    source: str  # Name of the acceptance file
     results: tuple[Criterion, ...]
 
     @property
@@ -129,11 +122,11 @@ class Acceptance:
 
     def document(self) -> dict[str, Any]:
         """JSON document."""
-        return {"file": self.criteria.source, "result": self.result, "criteria": self.results}
+        return {"file": self.source, "result": self.result, "criteria": self.results}
 
 
 class _File(msgspec.Struct, frozen=True):
-    acceptance: Table
+    acceptance: Criteria
 
 
 def read_criteria(path: Path) -> Criteria:
@@ -149,14 +142,13 @@ def read_criteria(path: Path) -> Criteria:
         raise UsageError(f"{source}: {err.strerror}") from err
     except (ValueError, RecursionError) as err:
         raise UsageError(f"{source}: expected TOML: {err}") from err
-    found = read(_File, content, source, UsageError).acceptance
-    return Criteria(**msgspec.structs.asdict(found), source=path.name)
+    return read(_File, content, source, UsageError).acceptance
 
 
-def judge(criteria: Criteria, study: Study, without_part: Sequence[str]) -> Acceptance:
+def judge(criteria: Criteria, source: str, study: Study, without_part: Sequence[str]) -> Acceptance:
     """Results of all criteria. That each run came to its end and its log is whole is always one of them.
 
-    ``without_part`` says of each log that is not used why.
+    ``source`` is the name of their file, ``without_part`` says of each log that is not used why.
     """
     runs, several = study.runs, len(study.runs) > 1
     results = [_completed(run, several) for run in runs]
@@ -173,24 +165,11 @@ def judge(criteria: Criteria, study: Study, without_part: Sequence[str]) -> Acce
     for run in runs:
         of = f", {run.name}" if several else ""
         if criteria.budgets.missed is not None:
-            results.append(_counted(f"missed periods{of}", criteria.budgets.missed, _missed(run)))
+            missed = None if run.timing is None else run.timing.share("missed")
+            results.append(_counted(f"missed periods{of}", criteria.budgets.missed, missed))
         if criteria.budgets.lost is not None:
-            results.append(_counted(f"lost samples{of}", criteria.budgets.lost, _lost(run)))
-    return Acceptance(criteria, tuple(results))
-
-
-def _missed(run: Run) -> float | None:
-    """Share of periods without a sample in time; None if it was not measured."""
-    try:
-        return timing(run.log).share("missed")
-    except LogError:
-        return None
-
-
-def _lost(run: Run) -> float | None:
-    """Share of the samples that are not in the log; None without an experiment."""
-    x = run.experiment
-    return None if x is None or x.quality.planned == 0 else 1.0 - int(x.measured.sum()) / max(len(x.measured), 1)
+            results.append(_counted(f"lost samples{of}", criteria.budgets.lost, run.lost))
+    return Acceptance(source, tuple(results))
 
 
 def _doubt(study: Study) -> str:
@@ -277,9 +256,9 @@ def junit(found: Acceptance) -> str:
     results = [(one, one.result) for one in found.results]
     failed, skipped = (sum(result is kind for _, result in results) for kind in (Result.FAIL, Result.CANNOT_TELL))
     counts = {"tests": str(len(results)), "failures": str(failed), "skipped": str(skipped)}
-    suite = ElementTree.Element("testsuite", {"name": found.criteria.source, **counts})
+    suite = ElementTree.Element("testsuite", {"name": found.source, **counts})
     for one, result in results:
-        case = ElementTree.SubElement(suite, "testcase", {"classname": found.criteria.source, "name": one.name})
+        case = ElementTree.SubElement(suite, "testcase", {"classname": found.source, "name": one.name})
         said = f"required {one.required}; found {one.found}"
         if result is not Result.PASS:
             kind = "failure" if result is Result.FAIL else "skipped"

@@ -31,7 +31,7 @@ def text(study: Study, *, verbose: bool = False) -> str:
     e, found = study.estimate, verdict(study)
     lines = [
         *stops(study),
-        *listed("", [*(line for _, line in say.outside(study, e.bench)), say.simulated(study.logs, study.names)]),
+        *listed("", [*(line for _, line in say.outside(study, e.bench)), say.simulated(study)]),
         *listed("WARNING: ", say.missing(study)),
     ]
     if found.code is Code.ABORTED and not verbose:

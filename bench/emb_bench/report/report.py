@@ -20,7 +20,7 @@ from emb_bench.logs import timing
 from emb_bench.logs.info import info_document
 from emb_bench.logs.timing import INTERVALS, Timing, quantiles
 from emb_bench.numbers import p_value, seconds, signed
-from emb_bench.report import figures, tables
+from emb_bench.report import figures, tables, trend
 from emb_bench.report import sentences as say
 from emb_bench.report.acceptance import Acceptance
 from emb_bench.report.caveats import caveats
@@ -42,10 +42,7 @@ from emb_bench.report.page import (
     code,
 )
 from emb_bench.report.text import Cell, Table
-from emb_bench.report.trend import Trend, trends
-from emb_bench.report.trend import panels as trend_panels
-from emb_bench.report.trend import table as run_table
-from emb_runtime.errors import BenchFileError, LogError
+from emb_runtime.errors import BenchFileError
 from emb_runtime.numbers import plain
 from emb_runtime.safety.end_stop import end_stop_speed
 
@@ -77,7 +74,7 @@ class Report:
     @property
     def simulated(self) -> str:
         """That the values are not those of a real machine; empty if no log says so."""
-        return say.simulated([run.log for run in self.study.used or self.study.runs], self.study.names)
+        return say.simulated(self.study)
 
     @property
     def sentence(self) -> str:
@@ -86,31 +83,20 @@ class Report:
 
     @property
     def _sentence(self) -> str:
-        code, stops = self.verdict.code, self.study.stops
-        if not self.compared and code in (Code.ABORTED, Code.STOPPED):
+        code, stops, compared = self.verdict.code, self.study.stops, self.study.side_by_side
+        if not compared and code in (Code.ABORTED, Code.STOPPED):
             more = f", and {len(stops) - 1} more" if len(stops) > 1 else ""
             return f"{'NOT ACCEPTED. ' if self.acceptance else ''}{say.stopped(stops[0])}{more}"
         if self.acceptance is not None:
             return self.acceptance.verdict
-        if self.compared:
-            return say.compared(self.study)
+        if compared:
+            return say.compared(compared)
         return say.ONLY_ALONE if code is Code.APART else say.headline(self.study)
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict, that of the acceptance criteria before that on the model; of runs side by side the worse one."""
-        accepted = None if self.acceptance is None else self.acceptance.result
-        return min((verdict(study, accepted) for study in self.studies), key=lambda one: list(Code).index(one.code))
-
-    @property
-    def compared(self) -> bool:
-        """Returns True if the runs stand side by side, each estimated alone."""
-        return self.study.joint is None and all(run.alone is not None for run in self.study.runs)
-
-    @property
-    def studies(self) -> list[Study]:
-        """The studies that the verdict is on: the joint one, or of runs side by side each one's."""
-        return [run.alone for run in self.study.runs if run.alone is not None] if self.compared else [self.study]
+        """The verdict, that of the acceptance criteria before that on the model."""
+        return verdict(self.study, None if self.acceptance is None else self.acceptance.result)
 
     @property
     def without_part(self) -> list[str]:
@@ -130,30 +116,29 @@ class Report:
 
 def page_of(report: Report) -> Page:
     """The page about a report."""
-    study, found = report.study, report.verdict
+    study, found, compared = report.study, report.verdict, report.study.side_by_side
     # Of an experiment that was cut short no value is used, nor a prediction with it.
     shown = study.joint is not None and found.code is not Code.ABORTED
     runs = study.runs
     one = runs[0] if len(runs) == 1 else None
-    motions = [Motion.of(run, report.bench, run.alone if report.compared else study if shown else None) for run in runs]
-    reported = study.used or runs
+    motions = [Motion.of(run, report.bench, run.alone if compared else study if shown else None) for run in runs]
     names = study.names
-    began = sorted(filter(None, (run.log.began for run in reported)))
-    sources = ", ".join(sorted({run.log.source for run in reported}))
+    began = sorted(filter(None, (run.log.began for run in study.reported)))
+    sources = ", ".join(sorted({run.log.source for run in study.reported}))
     when = "" if not began else f", {began[0]}" + (f" to {began[-1]}" if began[-1] != began[0] else "")
     to_do = say.remedies(study, stopped=bool(study.stops)) if shown else []
     drawn = [figures.of_run(motion) for motion in motions]
-    several = trends(study.used) if len(study.used) > 1 and not report.compared else []
+    several = trend.trends(study.used) if len(study.used) > 1 and not compared else []
     facts, table = _tested(report)
-    sections = {
-        "compared": ("Side by side", _compared(report, drawn)) if report.compared else None,
-        "runs": None if one or report.compared else ("Runs", _runs(runs, several)),
-        "parameters": ("Parameters", _parameters(study)) if shown else None,
-        "next": ("What to do next", _next(study, found, to_do)) if to_do else None,
-        "motion": (_measured(motions[0]), [_motion(motions[0], drawn[0])]) if one and drawn[0] else None,
-        "tested": ("What was tested", [facts, table, None if shown else _signature(study)]),
-    }
-    parts = [Section(name, *part) for name, part in sections.items() if part is not None]
+    sections = [
+        Section("compared", "Side by side", _compared(study, drawn)) if compared else None,
+        None if one or compared else Section("runs", "Runs", _runs(runs, several)),
+        Section("parameters", "Parameters", _parameters(study)) if shown else None,
+        Section("next", "What to do next", _next(study, found, to_do)) if to_do else None,
+        Section("motion", _measured(motions[0]), [_motion(motions[0], drawn[0])]) if one and drawn[0] else None,
+        Section("tested", "What was tested", [facts, table, None if shown else _signature(study)]),
+    ]
+    parts = [part for part in sections if part is not None]
     return Page(
         mark="SIMULATED: " if report.simulated else "",
         number=report.number,
@@ -183,10 +168,10 @@ def _banners(report: Report, found: Verdict, *, shown: bool) -> Iterator[Text]:
         yield Text(say.headline(study), "note" if found.holds else "banner bad")
         if study.checks.apart:
             yield Text(say.ONLY_ALONE, "banner care")
-    for run in study.used or study.runs:
+    for run in study.reported:
         if not run.log.complete:
             yield Text(f"{run.name}: the log is NOT complete: {run.log.missing}", "banner care")
-    yield from (Text(say.stopped(stop), "banner bad") for stop in study.stops[0 if report.compared else 1 :])
+    yield from (Text(say.stopped(stop), "banner bad") for stop in study.stops[0 if study.side_by_side else 1 :])
     # Without an estimate the first sentence names the runs already, but not the files that were left out.
     lines = report.without_part if study.joint is not None else report.without_part[: len(report.left_out)]
     yield from (Text(line, "banner care") for line in lines)
@@ -196,8 +181,8 @@ def _summary(report: Report, found: Verdict, *, shown: bool) -> Iterator[Block |
     """The verdict on the model, and on the run if there is one."""
     study, rows = report.study, list[tuple[str, Words | Sequence[Block]]]()
     one = study.runs[0] if len(study.runs) == 1 else None
-    if report.compared:
-        for own in report.studies:
+    if study.side_by_side:
+        for own in study.side_by_side:
             name = own.names[0]
             rows += [(f"Model, {name}", list(_model(own, verdict(own)))), (f"Run, {name}", _end(own.runs[0]))]
     else:
@@ -211,13 +196,13 @@ def _summary(report: Report, found: Verdict, *, shown: bool) -> Iterator[Block |
             rows.append(("Advice", f"{advice}. Find the cause before the next run."))
     yield Facts(rows)
     yield tables.acceptance_table(report.acceptance)
-    if not shown and not report.compared:
+    if not shown and not study.side_by_side:
         return
     yield Text(f"sigma: {say.TERMS['sigma']}. chi2/n: {say.TERMS['chi2/n']}.", "note print")
-    mark = "{}: {}" if report.compared else "{1}"
+    mark = "{}: {}" if study.side_by_side else "{1}"
     if defects := [
         mark.format(own.names[0], line)
-        for own in report.studies
+        for own in study.side_by_side or [study]
         for line in (*say.missing(own), *caveats(own.estimate))
     ]:
         yield Heading("Before using a number", 3)
@@ -258,35 +243,35 @@ def _end(run: Run) -> Words:
     return [end, f" ({detail})" if detail else "", f"; {said}", whole]
 
 
-def _runs(runs: Sequence[Run], found: Sequence[Trend]) -> list[Block | None]:
+def _runs(runs: Sequence[Run], found: Sequence[trend.Trend]) -> list[Block | None]:
     """Each run by itself, and whether they agree."""
     agreed: list[Words] = []
-    for trend in found:
-        if (test := trend.agreement) is not None:
+    for one in found:
+        if (test := one.agreement) is not None:
             chance = p_value(test.p_value)
             says = f": the runs agree ({chance})." if test.constant else (
                 f": the runs do NOT agree: they scatter {plain(test.scatter)} times as much as their intervals allow "
                 f"({chance})."
             )  # fmt: skip
-            agreed.append([Cell(trend.label, "good" if test.constant else "bad"), says])
-    panels = trend_panels(found)
+            agreed.append([Cell(one.label, "good" if test.constant else "bad"), says])
+    panels = trend.panels(found)
     caption = (
         "Each run is evaluated alone, in the order of the logs. Shown is the distance from the median of the runs in "
         "which the model fits, ± total (95 %, k=2) without the errors that all runs share."
     )
-    return [run_table(runs, found), Items(agreed), Figures(panels, caption) if panels else None]
+    return [trend.table(runs, found), Items(agreed), Figures(panels, caption) if panels else None]
 
 
-def _compared(report: Report, drawn: Sequence[Sequence[Panel]]) -> list[Block | None]:
+def _compared(study: Study, drawn: Sequence[Sequence[Panel]]) -> list[Block | None]:
     """Two runs in a column each: verdict, parameters, motion."""
-    left, right = (study.names[0] for study in report.studies)
+    left, right = study.names
     pairs = [panel for pair in zip(*drawn, strict=False) for panel in pair]
     caption = f"Left (on a narrow page first) {left}, right {right}; each with the prediction of its own estimate."
-    wrong = [own for own in report.studies if not verdict(own).holds]
+    wrong = [own for own in study.side_by_side if not verdict(own).holds]
     return [
-        tables.compared(report.study.runs),
+        tables.compared(study.side_by_side),
         *(Text(f"{own.names[0]}: the intervals do not include the error of a wrong model.", "bad") for own in wrong),
-        _care(say.changed_model(report.studies[1])),
+        _care(say.changed_model(study.side_by_side[1])),
         Figures(pairs, caption),
     ]
 
@@ -315,7 +300,7 @@ def _parameters(study: Study) -> list[Block | None]:
 
 def _signature(study: Study) -> Facts:
     """Lines to be signed; temperature and supply as the nodes sent them, the mean of the runs."""
-    logs, told = [run.log.conditions for run in study.used or study.runs], list[str]()
+    logs, told = [run.log.conditions for run in study.reported], list[str]()
     for name, condition in CONDITIONS.items():
         if values := [one[name] for one in logs if name in one]:
             told.append(f"{plain(sum(values) / len(values), 4)} {condition.unit}")
@@ -386,29 +371,25 @@ def _evidence(study: Study) -> Iterator[Section]:
 def _runs_in_full(report: Report, motions: Sequence[Motion], drawn: Sequence[Sequence[Panel]]) -> Iterator[Section]:
     """Evidence of each run: folded by itself, or inside the fold of its run."""
     if len(motions) == 1:
-        yield from (Section(name, title, blocks, 3, folded=True) for name, title, blocks in _of_run(motions[0]))
+        yield from _of_run(motions[0])
         return
     for n, (motion, panels) in enumerate(zip(motions, drawn, strict=True), 1):
-        own = motion.run.alone if report.compared else None
-        parts: list[Block | None] = [_motion(motion, panels) if panels and own is None else None]
-        if own is not None:
-            parts += [replace(part, name=f"run-{n}-{part.name}", level=4, folded=False) for part in _evidence(own)]
-        parts += [Section(f"run-{n}-{name}", title, blocks, 4) for name, title, blocks in _of_run(motion)]
-        yield Section(f"run-{n}", f"Run {n}: {motion.run.name}", parts, 3, folded=True)
+        own = motion.run.alone if report.study.side_by_side else None
+        parts = [*(() if own is None else _evidence(own)), *_of_run(motion)]
+        first = _motion(motion, panels) if panels and own is None else None
+        inside = (replace(part, name=f"run-{n}-{part.name}", level=4, folded=False) for part in parts)
+        yield Section(f"run-{n}", f"Run {n}: {motion.run.name}", [first, *inside], 3, folded=True)
 
 
-Part = tuple[str, str, Sequence[Block | None]]
-
-
-def _of_run(motion: Motion) -> Iterator[Part]:
+def _of_run(motion: Motion) -> Iterator[Section]:
     if motion.cycles is not None:
-        yield "excitation", "Excitation", _excitation(motion)
-    punctual = timing_of(motion.run)
+        yield Section("excitation", "Excitation", _excitation(motion), 3, folded=True)
+    punctual = motion.run.timing
     if punctual is not None and (table := intervals(punctual)) is not None:
-        yield "timing", "Timing", _timing(punctual, table)
+        yield Section("timing", "Timing", _timing(punctual, table), 3, folded=True)
     if not motion.run.log.is_recording:
-        yield "safety", "Safety", _safety(motion)
-    yield "log", "The log", list(_log(motion.run))
+        yield Section("safety", "Safety", _safety(motion), 3, folded=True)
+    yield Section("log", "The log", list(_log(motion.run)), 3, folded=True)
 
 
 def _excitation(motion: Motion) -> list[Block | None]:
@@ -423,14 +404,6 @@ def _excitation(motion: Motion) -> list[Block | None]:
     marks = "The bars below the current mark periods in which the sent current differs from the requested one:"
     reasons = [f"{str(reason.name).lower()}: {words}" for reason, words in REASONS.items()]
     return [Text(said), Text(marks), Items(reasons)]
-
-
-def timing_of(run: Run) -> Timing | None:
-    """Timing of a run; None if its log has no control cycles."""
-    try:
-        return timing.timing(run.log)
-    except LogError:
-        return None
 
 
 def intervals(t: Timing) -> Table | None:
@@ -624,11 +597,12 @@ def _plural(word: str, count: int) -> str:
 def document(report: Report) -> dict[str, Any]:
     """JSON document with the content of the page; numbers may be infinite."""
     study = report.study
-    estimated, reported = study.joint is not None, study.used or study.runs
+    estimated = study.joint is not None
+    owns = study.side_by_side or [study] * len(study.runs)
     found: dict[str, Any] = to_json(
         {
             "number": report.number,
-            "simulated": any(run.log.simulated for run in reported),
+            "simulated": any(run.log.simulated for run in study.reported),
             "made_by": report.made_by,
             "acceptance": None if report.acceptance is None else report.acceptance.document(),
             "model_fits": study.model_fits if estimated else None,
@@ -636,22 +610,21 @@ def document(report: Report) -> dict[str, Any]:
             "why_no_estimate": study.why_not,
             "left_out": [{"log": path, "why": why} for path, why in report.left_out],
             "estimate": estimate_document(study) if estimated else None,
-            "compared": report.studies[1].checks.drifts if report.compared else None,
-            "runs": [_run_document(run, run.alone if report.compared and run.alone else study) for run in study.runs],
+            "compared": study.side_by_side[1].checks.drifts if study.side_by_side else None,
+            "runs": [_run_document(run, own) for run, own in zip(study.runs, owns, strict=True)],
         }
     )
     return found
 
 
 def _run_document(run: Run, study: Study) -> dict[str, Any]:
-    punctual = timing_of(run)
     found: dict[str, Any] = {
         "began": run.log.began,
         "simulated": bool(run.log.simulated),
         "why_not_estimated": run.why_not,
         "sha256": run.log.sha256,
         "info": None if run.log.is_recording else info_document(run.log),
-        "timing": None if punctual is None else timing.document(punctual),
+        "timing": None if run.timing is None else timing.document(run.timing),
     }
     x, alone = run.experiment, run.alone
     if x is not None:

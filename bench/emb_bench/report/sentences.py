@@ -28,7 +28,6 @@ from emb_bench.estimate.records import (
 from emb_bench.experiment.experiment import Lack
 from emb_bench.information.evaluation import default_model
 from emb_bench.information.identifiability import Doubt
-from emb_bench.logs.log import RunLog
 from emb_bench.numbers import amount, p_value, percent
 from emb_bench.report.information import DOUBTS, doubts, lacks, taken_for_acted, trade_offs
 from emb_runtime.config.bench import PARAMETER_NAMES
@@ -85,13 +84,13 @@ def effects(machine: Machine | None) -> dict[str, str]:
 # ---- the verdict on a study ----
 
 
-def simulated(logs: Sequence[RunLog], names: Sequence[str]) -> str:
+def simulated(study: Study) -> str:
     """That values are not those of a real machine; empty if no log says so."""
-    marked = [(name, log.simulated) for name, log in zip(names, logs, strict=True) if log.simulated]
+    marked = [(run.name, run.log.simulated) for run in study.reported if run.log.simulated]
     if not marked:
         return ""
     where = ", ".join(name for name, _ in marked)
-    some = f" in {len(marked)} of {len(logs)} runs ({where})" if len(marked) < len(logs) else ""
+    some = f" in {len(marked)} of {len(study.reported)} runs ({where})" if len(marked) < len(study.reported) else ""
     driven = " and ".join(dict.fromkeys(what for _, what in marked))
     return f"SIMULATED: the values are of {driven}{some}, not of a real machine."
 
@@ -123,9 +122,8 @@ ONLY_ALONE = (
 )
 
 
-def compared(study: Study) -> str:
+def compared(studies: Sequence[Study]) -> str:
     """Verdict on each of two runs side by side, and the parameters in which they differ."""
-    studies = [run.alone for run in study.runs if run.alone is not None]
     changes = [d for d in studies[1].checks.drifts if d.drifted]
     differ = "; ".join(f"{d.name} {drift(d)}" for d in changes) or "No parameter differs significantly"
     return f"{'; '.join(f'{own.names[0]}: {verdict(own).code.value}' for own in studies)}. {differ}."

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from emb_bench.analysis.drift import Drift
-from emb_bench.analysis.study import Result, Run, Study, verdict
+from emb_bench.analysis.study import Result, Study, verdict
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.effects import shown_as
 from emb_bench.estimate.estimate import OF_THE_BENCH, Estimate
@@ -38,7 +38,7 @@ def acceptance_table(acceptance: Acceptance | None) -> Table | None:
         for one in acceptance.results
     ]
     header = ["criterion", "required", "found (95 % interval)", "result", "why"]
-    return Table(f"Acceptance criteria of {acceptance.criteria.source}", header, rows, words=range(len(header)))
+    return Table(f"Acceptance criteria of {acceptance.source}", header, rows, words=range(len(header)))
 
 
 def parameters(study: Study, *, brief: bool = False) -> Table:
@@ -242,9 +242,9 @@ def correlation(e: Estimate) -> tuple[Table | None, list[str]]:
     return (Table("Correlation of the estimates", ["", *labels], rows), pairs) if len(labels) > 1 else (None, [])
 
 
-def compared(runs: Sequence[Run]) -> Table:
+def compared(studies: Sequence[Study]) -> Table:
     """Two runs that were estimated alone, in a column each: verdict, parameters, and the change of these."""
-    first, second = (run.alone for run in runs if run.alone is not None)
+    first, second = studies
     changes, found = {d.name: d for d in second.checks.drifts}, [verdict(first), verdict(second)]
     rows: list[list[str]] = [["verdict", *(Cell(one.code.value, one.tone) for one in found), "", "", ""]]
     for c in (c for c in first if c.label in second):
@@ -257,7 +257,7 @@ def compared(runs: Sequence[Run]) -> Table:
         else:
             rows.append([*row, _change(d), signed(d.sigmas, "+.1f"), answer(d.drifted, good=False)])
     title = "Value ± total (95 %, k=2); difference: second less first; sigma: in its deviations between runs of a brake"
-    return Table(title, ["", *(run.name for run in runs), "difference", "sigma", "differs"], rows, words=(0, 5))
+    return Table(title, ["", *(own.names[0] for own in studies), "difference", "sigma", "differs"], rows, words=(0, 5))
 
 
 def _change(d: Drift) -> str:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.analysis.conclusion import Conclusion
 from emb_bench.analysis.several_runs import Constancy, constancy
 from emb_bench.analysis.study import Run, Study, verdict
 from emb_bench.brake.parameters import UNITS
@@ -48,7 +47,7 @@ def trends(runs: Sequence[Run]) -> list[Trend]:
 
 
 def _trend(studies: Sequence[Study], label: str) -> Trend:
-    found = [_conclusion(study, label) for study in studies]
+    found = [study[label] for study in studies]
     usable = np.array([c.identified and verdict(study).holds for c, study in zip(found, studies, strict=True)])
     values, half = np.array([c.value for c in found]), np.array([_half(study, label) for study in studies])
     ends = np.stack([values - half, values + half], axis=1)
@@ -70,10 +69,6 @@ def _half(study: Study, label: str) -> float:
     e = study.estimate
     i = e.labels.index(label)
     return NORMAL_95 * float(e.between_runs()[i] * e.scale[i])
-
-
-def _conclusion(study: Study, label: str) -> Conclusion:
-    return next(c for c in study.conclusions if c.label == label)
 
 
 def panels(found: Sequence[Trend]) -> list[Panel]:
@@ -111,8 +106,9 @@ def table(runs: Sequence[Run], found: Sequence[Trend]) -> Table:
     """One row for each run, those without an estimate included."""
     rows, at = [], 0
     for n, run in enumerate(runs, 1):
+        lost = NOTHING if run.lost is None else percent(run.lost)
         outcome = Cell(run.log.exit_reason, "" if run.log.exit_reason == DONE else "bad")
-        row: list[str] = [f"{n}: {run.name}", run.log.began.removesuffix(" UTC") or "not recorded", outcome, _lost(run)]
+        row: list[str] = [f"{n}: {run.name}", run.log.began.removesuffix(" UTC") or "not recorded", outcome, lost]
         if run.alone is None:
             rows.append([*row, Cell("no estimate", "care"), *[NOTHING] * len(found)])
             continue
@@ -128,8 +124,3 @@ def table(runs: Sequence[Run], found: Sequence[Trend]) -> Table:
     title = f"Each run alone; ± total (95 %, k=2) without errors that the runs share; {less}".removesuffix("; ")
     header = ["run", "recorded [UTC]", "ended", "lost", "fits", *(f"{trend.label} [{trend.unit}]" for trend in found)]
     return Table(title, header, rows, words=(0, 1, 2, 4))
-
-
-def _lost(run: Run) -> str:
-    x = run.experiment
-    return NOTHING if x is None else percent(1.0 - int(x.measured.sum()) / max(len(x.measured), 1))

@@ -37,7 +37,7 @@ from emb_bench.report.figures import applied_as_sent
 from emb_bench.report.motion import Motion
 from emb_bench.report.page import html
 from emb_bench.report.report import Report as Made
-from emb_bench.report.report import document, intervals, page_of, timing_of, with_units
+from emb_bench.report.report import document, intervals, page_of, with_units
 from emb_bench.report.sentences import MORE, effects
 from emb_runtime.errors import EXIT_OUTSIDE, LogError
 from emb_runtime.log.ring_buffer import Attachment, EventRecord
@@ -410,7 +410,7 @@ def test_real_time_is_in_the_table(folder: Path, bench: Bench, simulate: Simulat
     ]
     metadata = {"emb.run": {"steps": "60", "iface": "can0"}}
     real = gathered(bench, write_log(folder / "real.mcap", run, steps=60, metadata=metadata))
-    punctual = timing_of(real.study.runs[0])
+    punctual = real.study.runs[0].timing
     assert punctual is not None
     table = intervals(punctual)
     assert table is not None
