@@ -191,9 +191,8 @@ def _summary(report: Report, found: Verdict, *, shown: bool) -> Iterator[Block |
         rows.append(("Run", _end(one)))
     for stop in study.stops:
         if stop.cause:
-            advice = stop.advice[:1].upper() + stop.advice[1:]
             rows.append(("Cause" if one else f"Cause, {stop.log}", stop.cause))
-            rows.append(("Advice", f"{advice}. Find the cause before the next run."))
+            rows.append(("Advice", f"{_capital(stop.advice)}. Find the cause before the next run."))
     yield Facts(rows)
     yield tables.acceptance_table(report.acceptance)
     if not shown and not study.side_by_side:
@@ -235,9 +234,9 @@ def _model(study: Study, found: Verdict) -> Iterator[Block]:
 def _end(run: Run) -> Words:
     """End of a run, its samples, and whether its log is whole."""
     log, x = run.log, run.experiment
-    detail, samples = log.end.get("detail"), 0 if x is None else x.measured.sum()
+    detail, samples = log.end.get("detail"), 0 if x is None else int(x.measured.sum())
     periods = "" if x is None else f"{x.periods} of {x.quality.planned} periods, "
-    said = f"{periods}{samples} {_plural('sample', samples)}; " if periods else ""
+    said = f"{periods}{samples} sample{'s' * (samples != 1)}; " if periods else ""
     whole = Cell("the log is complete", "good") if log.complete else Cell("the log is NOT complete", "bad")
     end = Cell(log.exit_reason, "good" if log.exit_reason == DONE else "bad")
     return [end, f" ({detail})" if detail else "", f"; {said}", whole]
@@ -585,10 +584,6 @@ def _capital(text: str) -> str:
 
 def _care(text: str) -> Text | None:
     return Text(f"{_capital(text)}.", "care") if text else None
-
-
-def _plural(word: str, count: int) -> str:
-    return word if count == 1 else f"{word}s"
 
 
 # ---- the document ----

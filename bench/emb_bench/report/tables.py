@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from emb_bench.analysis.conclusion import Standing
 from emb_bench.analysis.drift import Drift
 from emb_bench.analysis.study import Result, Study, verdict
 from emb_bench.brake.parameters import UNITS
@@ -20,6 +21,12 @@ from emb_bench.report.sentences import drift, limit
 from emb_bench.report.text import Cell, Table
 from emb_runtime.numbers import NOTHING, SMALL, around, plain
 
+STANDINGS = {
+    Standing.IDENTIFIED: Cell("yes", "good"),
+    Standing.BIASED: Cell("biased", "care"),
+    Standing.IF_MODEL_RIGHT: Cell("(yes)", "care"),
+    Standing.NOT_IDENTIFIED: Cell("NO", "bad"),
+}
 TONES = {Result.PASS: "good", Result.FAIL: "bad", Result.CANNOT_TELL: "care"}  # Colours of results
 
 
@@ -50,8 +57,6 @@ def parameters(study: Study, *, brief: bool = False) -> Table:
     words = (0, len(header) - 1)
     header += [] if brief else ["from nominal"]
     header += ["simulated", "error in sigma"] if study.truth is not None and not brief else []
-    biased = "biased" if found.biased else "(yes)"
-    yes = Cell("yes", "good") if found.holds else Cell(biased, "care")
     rows = []
     for i, c in zip(e.wanted(), study.conclusions, strict=True):
         unknown = e.unknowns[i]
@@ -59,7 +64,7 @@ def parameters(study: Study, *, brief: bool = False) -> Table:
         row: list[str] = [c.label, amount(c.value, c.interval, c.unit)]
         row += [relative(0.5 * (c.interval[1] - c.interval[0]), size)]
         row += [relative(c.repeatability, size)] if found.holds else []
-        row.append(yes if c.identified else Cell("NO", "bad"))
+        row.append(STANDINGS[c.standing])
         if not brief:
             nominal = getattr(e.bench.brake, unknown.name, None)
             change = float(e.values[i]) / nominal - 1.0 if nominal and unknown.relative else math.nan
@@ -248,9 +253,8 @@ def compared(studies: Sequence[Study]) -> Table:
     changes, found = {d.name: d for d in second.checks.drifts}, [verdict(first), verdict(second)]
     rows: list[list[str]] = [["verdict", *(Cell(one.code.value, one.tone) for one in found), "", "", ""]]
     for c in (c for c in first if c.label in second):
-        row: list[str] = [c.label]
-        for v, one in zip((c, second[c.label]), found, strict=True):
-            row.append(Cell(amount(v.value, v.interval, v.unit), "" if v.identified and one.holds else "care"))
+        tones = ((v, "" if v.standing is Standing.IDENTIFIED else "care") for v in (c, second[c.label]))
+        row: list[str] = [c.label, *(Cell(amount(v.value, v.interval, v.unit), tone) for v, tone in tones)]
         d = changes.get(c.label)
         if d is None or math.isinf(d.detectable):
             rows.append([*row, NOTHING, NOTHING, Cell("not known", "care")])
