@@ -33,7 +33,7 @@ class DesignOptions(Options):
     )
     params: Names = option(PARAMETER_NAMES, "unknown parameters (default: the four of the brake)", "NAMES")
     theta: str | Path | Mapping[str, float] | None = option(
-        None, "the brake's parameters, as name=value,...; the others are nominal", "THETA"
+        None, "the brake's parameters, as 'name=value,...' or the JSON of an estimate; the others are nominal", "THETA"
     )
     model: str = option(DEFAULT_PLANT, "plant of the bench (default: exact)", "MODEL")
     kind: str = option("physical", "which Fisher information (default: physical)", choices=("physical", "weighted"))
@@ -58,8 +58,8 @@ def design(options: DesignOptions | None = None, *, told: Callable[[str], object
     Raises:
         UsageError: an argument is wrong, no design was found, or scipy and numba are missing.
     """
+    from emb_bench.experiment.theta import read_theta
     from emb_bench.information.criteria import Criterion
-    from emb_bench.sim.simulated_brake import parse_assignments, true_parameters
 
     asked = options_of("design", DesignOptions, options, more)
     its, names = load_bench(asked.bench), names_of(asked.params)
@@ -70,9 +70,7 @@ def design(options: DesignOptions | None = None, *, told: Callable[[str], object
         from emb_bench.estimate.expected import IntervalCriterion
     name: Any = asked.criterion
     goal = Criterion(name) if name in ("D", "A", "E") else IntervalCriterion(name)
-    text = "" if asked.theta in (None, "nominal") else str(asked.theta)
-    theta = asked.theta if isinstance(asked.theta, Mapping) else parse_assignments(text, "--theta: ")
-    brake = true_parameters(its, theta, option="--theta: ")
+    _, brake, _ = read_theta(asked.theta, None, its)
     kind = cast("Kind", asked.kind)
     problem = make_problem(its, goal, names, model=asked.model, kind=kind, brake=brake, returns=asked.return_home)
     say_if_compiling()

@@ -35,8 +35,9 @@ def short(tmp_path: Path) -> Path:
 def test_the_file_holds_a_design_that_can_be_simulated_again(
     short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "design.csv"
-    assert main(["--bench", str(short), *QUICK, "--theta", "f_v=3e-5", "--seed", "4", "--output", str(out)]) == 0
+    out, theta = tmp_path / "design.csv", tmp_path / "estimate.json"
+    theta.write_text('{"parameters": {"f_v": 3e-5}}')
+    assert main(["--bench", str(short), *QUICK, "--theta", str(theta), "--seed", "4", "--output", str(out)]) == 0
     assert "limits held, home" in capsys.readouterr().out
     bench, (head, *rest) = load_bench(short), out.read_text(encoding="utf-8").splitlines()
     metadata = json.loads(head.removeprefix("# "))
