@@ -453,13 +453,7 @@ def _safety(motion: Motion) -> list[Block | None]:
             ),
             ("largest current", f"{plain(top.current, 4)} A, limit {plain(limits.current)} A"),
         ]
-    speed_at_stop, why_not = None, ""
-    try:
-        speed_at_stop = end_stop_speed(motion.bench)
-    except BenchFileError as err:
-        why_not = str(err)
-    worst = Cell(say.impact(motion.bench, speed_at_stop, why_not), "bad" if speed_at_stop or why_not else "")
-    rows.append(("if all commands stopped at the worst moment", worst))
+    rows.append(("if all commands stopped at the worst moment", _impact(motion.bench)))
     if why := log.end.get("node_stop_reason"):
         rows.append(("the node's stop reason", why[:LONGEST]))
     events = _events(motion)
@@ -469,6 +463,18 @@ def _safety(motion: Motion) -> list[Block | None]:
         events if events.rows else Text("No event was recorded."),
         Text(f"{more} further events are in report.json.") if more else None,
     ]
+
+
+def _impact(bench: Bench) -> Cell:
+    """Effect of a loss of all commands, for any brake of the shield's set."""
+    try:
+        speed = end_stop_speed(bench)
+    except BenchFileError as err:
+        return Cell(f"unknown: {err}", "bad")
+    how = "the node brakes" if bench.node.stop == "damped" else "the node switches the current off"
+    if speed == 0.0:
+        return Cell(f"{how}, and no brake of the set '{bench.shield.ranges}' reaches an end stop")
+    return Cell(f"{how}, and a brake of the set may hit an end stop with {plain(speed, 3)} rad/s", "bad")
 
 
 def _inside(text: str, inside: bool) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from emb_bench.analysis.conclusion import Conclusion
 from emb_bench.analysis.drift import Drift, Earlier
-from emb_bench.analysis.options import known_values
+from emb_bench.analysis.options import names_of
 from emb_bench.analysis.records import Candidate, HeldOut, Profile
 from emb_bench.analysis.study import Code, Stop, Study, verdict
 from emb_bench.brake.parameters import CURVED, PARAMETERS, quantity
@@ -31,7 +31,6 @@ from emb_bench.information.identifiability import Doubt
 from emb_bench.numbers import amount, p_value, percent
 from emb_bench.report.information import DOUBTS, doubts, lacks, taken_for_acted, trade_offs
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.estimator.estimate import NORMAL_95
 from emb_runtime.numbers import between, in_percent, plain
 from emb_runtime.system.terminal import one_line
 
@@ -549,9 +548,8 @@ def remedies(study: Study, *, stopped: bool) -> list[str]:
 
 
 def _known(study: Study) -> str:
-    """The option of a study for parameters that are known beforehand."""
-    known = known_values(study.options.known).items()
-    said = ",".join(f"{name}={value:.6g}±{NORMAL_95 * deviation:.3g}" for name, (value, deviation) in known)
+    """The option of a study for parameters that are known beforehand, as it was given."""
+    said = ",".join(names_of(study.options.known or ()))
     return f" --known {said}" if said else ""
 
 
@@ -560,13 +558,3 @@ def _options(study: Study) -> str:
     wanted, usual = study.options, "oem" if study.estimate.bench.machine is None else "windows"
     given = {"--method": "" if wanted.method in (None, usual) else wanted.method, "--model": wanted.model or ""}
     return "".join(f" {option} {value}" for option, value in given.items() if value)
-
-
-def impact(bench: Bench, speed: float | None, why_not: str) -> str:
-    """Effect of a loss of all commands, for any brake of the shield's set."""
-    if why_not or speed is None:
-        return f"unknown: {why_not}"
-    how = "the node brakes" if bench.node.stop == "damped" else "the node switches the current off"
-    if speed == 0.0:
-        return f"{how}, and no brake of the set '{bench.shield.ranges}' reaches an end stop"
-    return f"{how}, and a brake of the set may hit an end stop with {plain(speed, 3)} rad/s"

@@ -200,11 +200,15 @@ def test_the_first_remedy_for_each_choice_of_parameters_is_a_command_that_gives_
     assert all(row["interval_95"][0] <= row["true"] <= row["interval_95"][1] for row in found["parameters"].values())
 
 
-def test_a_remedy_keeps_the_model_and_the_method_that_were_asked_for(bench: Bench, log: Log) -> None:
+def test_a_remedy_keeps_what_was_asked_for(bench: Bench, log: Log) -> None:
     run = log("plant=stribeck,f_v=3e-5,seed=2")
     for options, end in (
         (EstimateOptions("k_1", starts=1, model="exact"), " --model exact"),
         (EstimateOptions("k_1", method="pem", model="exact", starts=1), " --method pem --model exact"),
+        (
+            EstimateOptions("k_1", known=["k_1=23.04±1%"], model="exact", starts=1),
+            " --known k_1=23.04±1% --model exact",
+        ),
     ):
         study = make_study(bench, [run], options)
         assert remedies(study, stopped=False)[0] == f"estimate all four: emb-replay estimate {run.path}{end}"
