@@ -109,7 +109,10 @@ def test_after_the_node_stopped_at_a_limit_nothing_moves_by_itself_though_it_tel
     def just_after_a_status(node: BrakeNode) -> bool:  # at rest again before the next one
         return node.obeyed > 100 and node.periods % STATUS_PERIODS == 10
 
-    sim.when(just_after_a_status, lambda node: node._latch(StopReason.LIMIT))
+    def stop_at_the_limit(node: BrakeNode) -> None:
+        node.state, node.stop_reason = NodeState.STOPPING, StopReason.LIMIT
+
+    sim.when(just_after_a_status, stop_at_the_limit)
     document = emb_run.document("--policy", str(path), "--home", code=3)
     assert (document["result"], document["node_at_rest"], document["node_stop_reason"]) == (
         "NODE_STOPPED",

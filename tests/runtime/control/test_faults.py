@@ -94,7 +94,7 @@ def moved_unseen(move: Callable[[SimTransport], object]) -> Receive:
 
 
 def push(transport: SimTransport) -> None:
-    transport.node._x[:2] = -4.0, -450.0
+    transport.node.angle, transport.node.velocity = -4.0, -450.0
 
 
 def away(transport: SimTransport) -> None:
@@ -150,10 +150,11 @@ def asked_often(times: int) -> Callable[[], bool]:
 
 def an_error_before_the_guard(simulate: Simulate) -> SimRun:
     """Whatever comes before it allows 6 A."""
-    guard = Guard(load_layout(), load_bench(), lambda _frame: None, limit=1.0)
+    buses: list[SimTransport] = []
+    guard = Guard(load_layout(), load_bench(), lambda frame: buses[0].send(frame), limit=1.0)
 
     def on_receive(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        guard._send = transport.send
+        buses[:] = [transport]
         return frame
 
     run = simulate(lambda _a, _v, k: 0.5 if k < 10 else 4.0, on_receive=on_receive, guard=guard)

@@ -67,6 +67,8 @@ class MappedBus:
         self.change: Change = lambda frame: frame
         self.at: tuple[int, Callable[[SimulatedDrive], object]] | None = None
         self.sent: list[Frame] = []
+        self.injected: list[Frame] = []
+        """Frames of somebody else, to be received before any other."""
         self.shift = 0
         """Periods that have passed when the bus is opened."""
         self.watchdog: float | None = WATCHDOG
@@ -85,7 +87,7 @@ class MappedBus:
 
     def open(self, _iface: str, bench: Bench, _identifiers: object = None) -> tuple[Transport, SteppedClock]:
         bus, clock = open_sim_drive(self.name, bench)
-        self.bus, self.drive = bus, bus.drive
+        self.bus, self.drive, self.clock = bus, bus.drive, clock
         self.drive.periods, self.drive.watchdog = self.shift, self.watchdog
         self._wrap(bus)
         self.transport = LockStepDrive(self.mapping, bench, bus, clock, f"map:{self.file}@sim-drive")
@@ -98,6 +100,8 @@ class MappedBus:
             if self.at is not None and hasattr(self, "transport") and self.transport.node.answers.obeyed >= self.at[0]:
                 action, self.at = self.at[1], None
                 action(self.drive)
+            if self.injected:
+                return self.injected.pop(0)._replace(time_ns=self.clock.now_ns(), own=False)
             frame = receive(deadline_ns)
             return frame if frame is None or frame.own else self.change(frame)
 

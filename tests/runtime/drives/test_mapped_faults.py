@@ -67,7 +67,7 @@ def interface_down(bus: MappedBus) -> None:
 def inject(bus: MappedBus, frame: Frame) -> None:
     """Put a frame of a stranger on the drive's bus."""
     bus.drive.receive(frame)
-    bus.bus._queue.append(frame._replace(time_ns=bus.bus._clock.now_ns(), own=False))
+    bus.injected.append(frame)
 
 
 def repeated(bus: MappedBus) -> None:

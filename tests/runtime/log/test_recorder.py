@@ -213,7 +213,7 @@ def test_whatever_writing_raises_the_run_is_told(
     def fail(*_: object, **__: object) -> None:
         raise kind("planted")
 
-    monkeypatch.setattr(recording.writer._mcap, place, fail)
+    monkeypatch.setattr(recorder_process.Writer, place, fail)
     ring.push(*pack(EventRecord(START, "X", "")))
     answer = recording.finish({"exit_reason": "done"})
     assert answer["error"] == f"writing failed: {kind.__name__}: {kind('planted')}"

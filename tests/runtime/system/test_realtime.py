@@ -17,33 +17,35 @@ def device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setattr(realtime, "_awake", None)
     monkeypatch.setattr(realtime, "WAKE_UP_LATENCY", str(tmp_path / "cpu_dma_latency"))
     yield tmp_path / "cpu_dma_latency"
-    if realtime._awake is not None:
-        os.close(realtime._awake)
+    for descriptor in held(tmp_path / "cpu_dma_latency"):
+        os.close(descriptor)
+
+
+def held(device: Path) -> list[int]:
+    """Descriptors of this process that are open on a file."""
+    return [int(link.name) for link in Path("/proc/self/fd").iterdir() if link.exists() and link.readlink() == device]
 
 
 def test_a_latency_of_zero_is_asked_for_once_and_stays_asked_for(device: Path) -> None:
     device.touch()
-    assert realtime._stay_awake() == "none that takes time to leave"
-    held = realtime._awake
-    assert held is not None
-    assert Path(f"/proc/self/fd/{held}").readlink() == device
-    assert realtime._stay_awake() == "none that takes time to leave"
+    assert realtime.stay_awake() == "none that takes time to leave"
+    (descriptor,) = held(device)
+    assert realtime.stay_awake() == "none that takes time to leave"
     assert device.read_bytes() == bytes(4)
-    assert realtime._awake == held
+    assert held(device) == [descriptor]
 
 
 def test_a_kernel_without_the_device_lacks_nothing(device: Path) -> None:
-    assert realtime._stay_awake() == "not managed by this kernel"
+    assert realtime.stay_awake() == "not managed by this kernel"
 
 
 def test_a_device_that_cannot_be_opened_is_not_obtained(device: Path) -> None:
     device.mkdir()
-    assert realtime._stay_awake() == f"not obtained: {device}: Is a directory"
+    assert realtime.stay_awake() == f"not obtained: {device}: Is a directory"
 
 
 def test_a_device_that_refuses_the_value_is_not_left_open(device: Path) -> None:
     device.symlink_to("/dev/full")
     before = len(list(Path("/proc/self/fd").iterdir()))
-    assert realtime._stay_awake() == f"not obtained: {device}: No space left on device"
-    assert realtime._awake is None
+    assert realtime.stay_awake() == f"not obtained: {device}: No space left on device"
     assert len(list(Path("/proc/self/fd").iterdir())) == before
