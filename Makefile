@@ -99,8 +99,7 @@ night: $(VENV)/.dev
 	$(BIN)/python -m tests.searches.lies
 	$(BIN)/python -m tests.searches.kills
 	$(BIN)/python -m tests.searches.fuzz
-	$(BIN)/python -m tests.searches.hostile_files --count 2000
-	$(BIN)/python -m tests.searches.damaged_logs
+	$(BIN)/python -m tests.searches.broken_files --count 2000
 	$(BIN)/python -m tests.searches.interrupt
 	$(PYTEST) $(PARALLEL) -m compiled tests/compiled --inputs 1000000 --timeout 7200
 	$(BIN)/python -m tools.proof

@@ -24,10 +24,10 @@ from emb_runtime.records import Call, CycleRecord, Frame, Reason, RunState
 from emb_runtime.safety.state_machine import Fault
 from tests.actors import constant_actor
 from tests.bench.conftest import Replay
-from tests.bench.damaged import rewritten
 from tests.bench.hostile import Driven, HostileBus, Thoughtful, drive, write_trace
 from tests.bench.simulated_logs import square
 from tests.benches import SENSOR_BENCH
+from tests.corrupt import rewritten
 from tests.runtime.control.test_faults import INJECTIONS
 
 from tests.conftest import Journal, SimRun, Simulate  # isort: skip

@@ -13,8 +13,8 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_hostile_files_end_no_command_badly_and_take_little_time_and_memory() -> None:
-    """A part of ``tests/searches/hostile_files.py``, of which 2,000 are played at night."""
-    command = [sys.executable, "-m", "tests.searches.hostile_files", "--count", "5", "--seed", "5000000"]
+    """A part of ``tests/searches/broken_files.py``, of which 2,000 are played at night."""
+    command = [sys.executable, "-m", "tests.searches.broken_files", "--count", "5", "--seed", "5000000"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=500)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "| 0 of 5; " in done.stdout

@@ -37,7 +37,7 @@ from emb_runtime.cli import main as emb_run
 from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, EXIT_USAGE, LogError, UsageError
 from emb_runtime.estimator.estimate import LOST, UNITS
 from emb_runtime.numbers import around, in_percent
-from tests.bench.damaged import rewritten, without
+from tests.corrupt import rewritten, without
 
 SECONDS = 20.0
 

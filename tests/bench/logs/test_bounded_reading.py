@@ -13,10 +13,9 @@ from emb_bench.cli.replay import main
 from emb_bench.logs.log import LARGEST_TEXT, read_log
 from emb_bench.logs.mcap_file import LARGEST, MOST_CARRIED, MOST_DESCRIBED, SMALL
 from emb_runtime.errors import LogError
-from tests.bench.damaged import chunk
 from tests.bench.simulated_logs import square, write_log
 from tests.conftest import Simulate
-from tests.fuzz.hostile_files import attachment, counted, file_of, metadata, records_of
+from tests.corrupt import attachment, chunk, counted, file_of, metadata, records_of
 
 EMPTY = b"\x80" + bytes(8)  # A record of a kind that readers pass over, with nothing in it
 

@@ -24,9 +24,9 @@ from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, Record
 
 from tests.bench.conftest import Replay  # isort: skip
 from tests.actors import constant_actor
-from tests.bench.damaged import rewritten, with_field, without
 from tests.bench.hostile import write_trace
 from tests.conftest import FunctionActor, Journal, SimRun, Simulate
+from tests.corrupt import rewritten, with_field, without
 
 STEPS = 300
 STOP_WHEN = "k_m=1%"

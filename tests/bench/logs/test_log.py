@@ -22,7 +22,7 @@ from emb_runtime.log.recorder import Recorder
 from emb_runtime.log.ring_buffer import Attachment, EventRecord, LogHeader
 from emb_runtime.records import CycleRecord
 
-from tests.bench.damaged import rewritten  # isort: skip
+from tests.corrupt import rewritten  # isort: skip
 from tests.bench.simulated_logs import WALL, square, write_log  # isort: skip
 from tests.conftest import SimRun, Simulate  # isort: skip
 
