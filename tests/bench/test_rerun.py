@@ -28,7 +28,7 @@ from tests.bench.hostile import Driven, HostileBus, Thoughtful, drive, write_tra
 from tests.bench.simulated_logs import square
 from tests.benches import SENSOR_BENCH
 from tests.corrupt import rewritten
-from tests.runtime.control.test_faults import INJECTIONS
+from tests.scenarios.table import IN_LOOP, loop_run
 
 from tests.conftest import Journal, SimRun, Simulate  # isort: skip
 from emb_bench.batch.campaign import find
@@ -36,8 +36,8 @@ from emb_runtime.control.actor import Still, homing_steps
 from tests.conftest import FunctionActor
 
 Law = Callable[[float, float, float], float]
-NOT_PLAYED = {Fault.GUARD_REJECTED}  # Fault of a guard that a log does not carry
-OF_A_WAY_HOME = {Fault.NOT_HOME, Fault.OUT_OF_LIMITS}
+NOT_PLAYED = {"unguarded"}  # Its guard is not carried by a log
+OF_A_WAY_HOME = {"not_home", "pushed_before"}
 Again = Callable[..., Rerun]
 
 
@@ -162,9 +162,9 @@ def changed(bench: Bench, old: str, new: str) -> Bench:
     return parse_bench(bench.text.replace(old, new), "changed")
 
 
-@pytest.mark.parametrize("fault", sorted(INJECTIONS.keys() - NOT_PLAYED), ids=lambda fault: fault.name)
+@pytest.mark.parametrize("name", sorted(IN_LOOP.keys() - NOT_PLAYED))
 def test_a_run_with_any_fault_is_reproduced(
-    recorded: Callable[..., Driven], again: Again, fault: Fault, bench: Bench
+    recorded: Callable[..., Driven], again: Again, name: str, bench: Bench
 ) -> None:
     laws: list[Law] = []
     benches: list[Bench] = []
@@ -174,9 +174,8 @@ def test_a_run_with_any_fault_is_reproduced(
         benches.append(arguments.get("on_bench", bench))
         return recorded(law, **{"steps": 500, **arguments})
 
-    run: Any = INJECTIONS[fault](record)
-    assert fault.name in run.journal.codes
-    purpose = "homing" if fault in OF_A_WAY_HOME else "experiment"
+    run: Any = loop_run(name, record)
+    purpose = "homing" if name in OF_A_WAY_HOME else "experiment"
     assert_reproduced(again(run, *laws, on=benches[0], purpose=purpose), run)
 
 

@@ -16,10 +16,10 @@ from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import LogError
 from emb_runtime.safety.end_stop import released_speed
-from tests.hil.plays import COMMAND, VELOCITY, Play
 from tests.independent import DATABASE, MESSAGES, protected
+from tests.scenarios.injections import ANGLE, COMMAND, STATUS, VELOCITY
+from tests.scenarios.table import Scenario
 
-ANGLE, STATUS = 0x100, 0x102
 STOPPING = 2
 NO_COMMAND = 15
 WATCHDOG_MS = 10.0  # The shipped bench's node.watchdog
@@ -43,7 +43,7 @@ class Sampled(NamedTuple):
 class Seen:
     """What a play left behind."""
 
-    play: Play
+    play: Scenario
     report: dict[str, Any]
     log: Path
     frames: list[tuple[int, int, bytes]] = field(repr=False)  # On the node's bus
@@ -98,7 +98,7 @@ def _genuine(identifier: int, data: bytes) -> bool:
     return len(data) == MESSAGES[identifier].length and data == protected(identifier, data[1:])
 
 
-def seen(play: Play, folder: Path) -> Seen:
+def seen(play: Scenario, folder: Path) -> Seen:
     """What a play left behind in the folder."""
     report = json.loads((folder / f"{play.name}.json").read_text())
     frames, run_frames = (
@@ -161,8 +161,8 @@ def illegal(it: Seen) -> list[str]:
     newest = {n: data[1] & 0x0F for n, (_, i, data) in enumerate(it.run_frames) if i == ANGLE and len(data) == 8}
     answered: set[int] = set()
     foreign = it.play.name in ("foreign_commander", "duplicates")
-    lossy = any(action["do"] in ("impair", "link") for action in it.play.actions)
-    held_up = any(action.get("by", {}).get("delay", 0.0) > 0.002 for action in it.play.actions)  # after the guard
+    lossy = any(action["do"] in ("impair", "link") for action in it.play.actions or ())
+    held_up = any(action.get("by", {}).get("delay", 0.0) > 0.002 for action in it.play.actions or ())  # after the guard
     expected = None
     for n, values in it.commands():
         data = it.run_frames[n][2]

@@ -2,7 +2,7 @@
 
     python -m tests.hil.stage PLAN.json OUT_DIR
 
-PLAN is a list of plays, see :class:`tests.hil.plays.Play`. For each it writes OUT_DIR/NAME.json: exit codes, outputs,
+PLAN is a list of plays, see :func:`tests.hil.plays.plan`. For each it writes OUT_DIR/NAME.json: exit codes, outputs,
 when each action was done, and all frames on the node's bus, and on the run's if it is another, as
 [time, identifier, data in hex].
 
@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import multiprocessing
 import os
 import shutil
 import signal
@@ -22,7 +23,6 @@ import socket
 import sys
 import time
 import tomllib
-import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -56,38 +56,27 @@ class Child:
 
     def __init__(self, main: Callable[[list[str]], int], argv: list[str], folder: Path, name: str) -> None:
         self.out, self.err = (folder / f"{name}.{stream}" for stream in ("out", "err"))
-        self.exit: int | None = None
-        sys.stdout.flush()
-        sys.stderr.flush()
-        self.pid = os.fork()
-        if self.pid == 0:
-            os._exit(self._become(main, argv))
+        self.process = multiprocessing.get_context("fork").Process(target=self._become, args=(main, argv))
+        self.process.start()
+        assert self.process.pid is not None
+        self.pid = self.process.pid
 
-    def _become(self, main: Callable[[list[str]], int], argv: list[str]) -> int:
+    def _become(self, main: Callable[[list[str]], int], argv: list[str]) -> None:
         for number, path in ((1, self.out), (2, self.err)):
             os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), number)
         sys.stdout, sys.stderr = (io.TextIOWrapper(os.fdopen(n, "wb", buffering=0), "utf-8") for n in (1, 2))
         signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.argv = ["emb", *argv]
-        code = 1
-        try:
-            code = main(argv)
-        except SystemExit as end:
-            code = end.code if isinstance(end.code, int) else 2
-        except BaseException:
-            traceback.print_exc()
-        with contextlib.suppress(OSError, ValueError):
-            sys.stdout.flush()
-            sys.stderr.flush()
-        return code
+        sys.exit(main(argv))
+
+    @property
+    def exit(self) -> int | None:
+        """Its exit code, that of a signal negative; None as long as it runs."""
+        return self.process.exitcode
 
     def running(self) -> bool:
         """Whether it has not ended."""
-        if self.exit is None:
-            pid, status = os.waitpid(self.pid, os.WNOHANG)
-            if pid:
-                self.exit = os.waitstatus_to_exitcode(status)
-        return self.exit is None
+        return self.process.exitcode is None
 
     def end(self) -> dict[str, Any]:
         """Wait for it, and by force if it takes too long; what it said."""

@@ -1,4 +1,4 @@
-"""Every play of tests/hil/plays.py against the programs as shipped, on a real SocketCAN bus, in one boot."""
+"""Every scenario that is played on a bus, against the programs as shipped, on a real SocketCAN bus, in one boot."""
 
 from __future__ import annotations
 
@@ -16,20 +16,23 @@ from emb_bench.cli.replay import main as replay
 from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import load_bench
 from tests.drives import SHIPPED
-from tests.hil.judge import ANGLE, STATUS, WATCHDOG_MS, Seen, judge, seen
-from tests.hil.plays import COMMAND, PLAYS, ROOT, SLOWLY, VELOCITY, Play, perform
+from tests.hil.judge import WATCHDOG_MS, Seen, judge, seen
+from tests.hil.plays import ROOT, SLOWLY, perform
 from tests.independent import DATABASE
+from tests.scenarios.injections import ANGLE, COMMAND, STATUS, VELOCITY
+from tests.scenarios.table import ON_BUS, Scenario
 
 WHOLE = tuple(f"mapped_{drive}" for drive in SHIPPED)  # Undisturbed runs of drives behind the gateway
 
 
-def is_nightly(play: Play) -> bool:
+def is_nightly(play: Scenario) -> bool:
     """Faults of mapped drives, which are also played in lock-step: tests/runtime/drives."""
     return play.name.startswith("mapped_") and play.name not in WHOLE
 
 
-CASES = [pytest.param(play, id=play.name, marks=pytest.mark.slow if is_nightly(play) else ()) for play in PLAYS]
-NAMED = {play.name: play for play in PLAYS}
+CASES = [
+    pytest.param(play, id=play.name, marks=pytest.mark.slow if is_nightly(play) else ()) for play in ON_BUS.values()
+]
 UNHEARD = ("loop_stopped", "loop_killed", "loop_hung", "loop_robbed")
 """The loop cannot send its stop frames: the watchdog does."""
 pytestmark = pytest.mark.timeout(3200)  # far beyond what a busy computer needs
@@ -44,15 +47,15 @@ def played(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     wanted: set[str] = set()
     for item in request.session.items:
         if callspec := getattr(item, "callspec", None):
-            wanted |= {value.name for value in callspec.params.values() if isinstance(value, Play)}
+            wanted |= {value.name for value in callspec.params.values() if isinstance(value, Scenario)}
         if marker := item.get_closest_marker("plays"):
             wanted |= set(marker.args)
-    perform([play for play in PLAYS if play.name in wanted], folder)
-    return lambda name: seen(NAMED[name], folder)
+    perform([play for play in ON_BUS.values() if play.name in wanted], folder)
+    return lambda name: seen(ON_BUS[name], folder)
 
 
 @pytest.mark.parametrize("play", CASES)
-def test_nothing_is_as_it_must_not_be(played: Played, play: Play) -> None:
+def test_nothing_is_as_it_must_not_be(played: Played, play: Scenario) -> None:
     """Results, commands, stop frames, stop time, limits, processes: each rule of tests/hil/judge.py; then the log."""
     verdict = judge(played(play.name))
     assert verdict.wrong == ()

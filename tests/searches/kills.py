@@ -15,17 +15,18 @@ import tempfile
 from pathlib import Path
 
 from tests.hil.judge import WATCHDOG_MS, judge, seen
-from tests.hil.plays import IN_HAND, Play, perform
+from tests.hil.plays import perform
+from tests.scenarios.table import IN_HAND, Scenario
 
 PERIOD, LAST = 1e-3, 480
 """Of the shipped bench [s]; the last command that is waited for, of 500."""
 
 
-def killed(number: int, draw: random.Random) -> Play:
+def killed(number: int, draw: random.Random) -> Scenario:
     """A run that is killed once."""
     after, pause = draw.randint(1, LAST), draw.uniform(0.0, PERIOD)
     kill = {"do": "signal", "to": "run", "signal": "SIGKILL", "after": after, "pause": pause, "stops": 0}
-    return Play(f"kill_{number:03d}", f"kill -9 after command {after}", (), (-9,), (kill,), may_lose=IN_HAND)
+    return Scenario(f"kill_{number:03d}", f"kill -9 after command {after}", (), None, (kill,), may_lose=IN_HAND)
 
 
 def main() -> int:

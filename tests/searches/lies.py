@@ -18,7 +18,7 @@ from emb_runtime.estimator.estimator import estimated
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.safety.state_machine import FAULTS
 from tests.lying.node import HONEST, Lie
-from tests.runtime.control.test_lies import run
+from tests.scenarios.lies import run
 
 BENCH = load_bench()
 SEEN: dict[str, tuple[Lie, ...]] = {

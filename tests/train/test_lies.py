@@ -13,7 +13,7 @@ from emb_train.env import EmbExcitationVectorEnv
 from emb_train.lies import LIES, shown
 from emb_train.play import Planned
 from emb_train.rewards import log_determinant
-from tests.runtime.control.test_lies import UNEXPLAINED, run
+from tests.scenarios.lies import UNEXPLAINED, run
 
 BENCH = load_bench()
 PLANS = {  # Parts of the limit of the speed, and periods

@@ -1,248 +1,25 @@
-"""Every fault is injected into a whole run; a fault that nothing injects fails here."""
+"""Every fault in a whole run of the simulated loop; one for which no scenario is written fails here."""
 
 from __future__ import annotations
 
 import dataclasses
-import math
 import re
-from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from typing import Any
 
 import pytest
 
 from emb_bench.sim.transport import SimTransport, SteppedClock
-from emb_runtime.can.messages import Layout, load_layout
-from emb_runtime.can.transport import TransmitQueueFullError
-from emb_runtime.config.bench import Sensors, load_bench
-from emb_runtime.errors import BusError
+from emb_runtime.can.messages import Layout
+from emb_runtime.config.bench import Sensors
 from emb_runtime.records import CurrentCommand, Frame, NodeState
-from emb_runtime.safety.guard import Guard
-from emb_runtime.safety.heartbeat import STOP_FRAMES, Unwatched
+from emb_runtime.safety.heartbeat import STOP_FRAMES
 from emb_runtime.safety.state_machine import FAULTS, Fault
 
 from tests.conftest import SimRun, Simulate  # isort: skip
 from tests.benches import SENSOR_BENCH
-from tests.independent import encoded, read
-
-MS = 1_000_000
-ANGLE, VELOCITY, STATUS, COMMAND = 0x100, 0x101, 0x102, 0x80
-
-
-def dropping(
-    identifier: int, periods: Sequence[int]
-) -> Callable[[Frame | None, SimTransport, SteppedClock], Frame | None]:
-    """Loses one message during some sampling periods of the node."""
-
-    def lose(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
-        while frame is not None and frame.identifier == identifier and transport.node.periods in periods:
-            frame = transport.receive(clock.now_ns())
-        return frame
-
-    return lose
-
-
-def changing(
-    change: Callable[[Frame], Frame], identifier: int | None = None, periods: range = range(10_000)
-) -> Callable[[Frame | None, SimTransport, SteppedClock], Frame | None]:
-    """Changes each frame, or those of one message, that comes during some sampling periods of the node."""
-
-    def receive(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        if frame is None or identifier not in (None, frame.identifier) or transport.node.periods not in periods:
-            return frame
-        return change(frame)
-
-    return receive
-
-
-def saying(**changes: float | Callable[[float], float]) -> Callable[[Frame], Frame]:
-    """Changes signals of each frame that has them: to a value, or by a function of the old one."""
-
-    def change(frame: Frame) -> Frame:
-        values = read(frame) or {}
-        new = {name: by(values[name]) if callable(by) else by for name, by in changes.items() if name in values}
-        return encoded(frame.identifier, values | new)._replace(time_ns=frame.time_ns) if new else frame
-
-    return change
-
-
-Receive = Callable[[Frame | None, SimTransport, SteppedClock], Frame | None]
-
-
-def at_period(period: int, action: Callable[[SimTransport], object]) -> Receive:
-    """Does something to the node while it is in one of its sampling periods."""
-
-    def receive(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        if transport.node.periods == period:
-            action(transport)
-        return frame
-
-    return receive
-
-
-def moved_unseen(move: Callable[[SimTransport], object]) -> Receive:
-    """Moves the brake in the first five periods, in which nobody looks but for the status."""
-
-    def receive(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
-        if transport.node.periods < 5:
-            move(transport)
-        while frame is not None and frame.identifier != STATUS and transport.node.periods < 5:
-            frame = transport.receive(clock.now_ns() + MS)
-        return frame
-
-    return receive
-
-
-def push(transport: SimTransport) -> None:
-    transport.node.angle, transport.node.velocity = -4.0, -450.0
-
-
-def away(transport: SimTransport) -> None:
-    transport.node.angle = 2.0
-
-
-def nothing(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
-    while frame is not None:
-        frame = transport.receive(clock.now_ns())
-    return None
-
-
-def drift(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-    late = max(transport.node.periods - 100, 0)
-    return frame and saying(Angle=lambda angle: angle + 0.03 * late)(frame)
-
-
-def stop(transport: SimTransport) -> None:
-    transport.node.state = NodeState.STOPPING
-
-
-def deafen(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-    transport.node.receive = lambda frame: None  # type: ignore[method-assign]
-    return frame
-
-
-def intruding() -> Receive:
-    once: Iterator[int] = iter([1])
-
-    def intrude(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        if frame is not None and transport.node.periods == 200 and next(once, 0):
-            return Frame(COMMAND, b"\x00\x00\x00\x00\x00", frame.time_ns)
-        return frame
-
-    return intrude
-
-
-def failing(error: type[BusError], *at: int) -> Callable[[Frame], None]:
-    """Fails to send the frames of these numbers."""
-    asked = iter(range(10**9))
-
-    def send(_frame: Frame) -> None:
-        if next(asked) in at:
-            raise error("can0: it does not go")
-
-    return send
-
-
-def asked_often(times: int) -> Callable[[], bool]:
-    asked = iter(range(10**9))
-    return lambda: next(asked) > times
-
-
-def an_error_before_the_guard(simulate: Simulate) -> SimRun:
-    """Whatever comes before it allows 6 A."""
-    buses: list[SimTransport] = []
-    guard = Guard(load_layout(), load_bench(), lambda frame: buses[0].send(frame), limit=1.0)
-
-    def on_receive(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        buses[:] = [transport]
-        return frame
-
-    run = simulate(lambda _a, _v, k: 0.5 if k < 10 else 4.0, on_receive=on_receive, guard=guard)
-    run.sent.extend(f._replace(own=False) for f in run.journal.frames if f.own)
-    return run
-
-
-class Pulse(Unwatched):
-    """A watchdog that speaks, or falls silent, at the n-th time that the loop asks."""
-
-    def __init__(self, trips_at: int = 10**9, silent_at: int = 10**9) -> None:
-        super().__init__()
-        self.trips_at, self.silent_at = trips_at, silent_at
-        self.asked = self.signs = 0
-        self.calls: list[bool] = []
-
-    @property
-    def tripped(self) -> bool:
-        self.asked += 1
-        return self.asked > self.trips_at
-
-    def watched(self, now_ns: int) -> bool:
-        self.signs += 1
-        return self.signs <= self.silent_at
-
-    def arm(self, now_ns: int) -> None:
-        self.calls.append(True)
-
-    def disarm(self) -> None:
-        self.calls.append(False)
-
-
-def later(identifier: int, begin: int, **changes: Any) -> Receive:
-    """Changes what the node says from a sampling period on."""
-    return changing(saying(**changes), identifier, range(begin, 10_000))
-
-
-def shortened(frame: Frame) -> Frame:
-    return frame._replace(data=frame.data[:4])
-
-
-def reported(frame: Frame) -> Frame:
-    return Frame(0x8, bytes(8), frame.time_ns, error=True)
-
-
-# Too many for an experiment, and within half a second not yet too many for the node to be lost.
-MISSING_21_PERCENT = [n for n in range(20, 10_000) if 21 * n % 100 < 21]
-INJECTIONS: dict[Fault, Callable[[Simulate], SimRun]] = {
-    Fault.NO_NODE: lambda run: run(on_receive=nothing),
-    Fault.NODE_NOT_READY: lambda run: run(on_receive=moved_unseen(away)),
-    Fault.SENSOR_LOST: lambda run: run(on_receive=dropping(ANGLE, range(100, 10_000))),
-    Fault.FRAMES_REJECTED: lambda run: run(on_receive=changing(shortened, VELOCITY, range(100, 110))),
-    Fault.OUT_OF_LIMITS: lambda run: run(homing=True, on_receive=moved_unseen(push)),
-    Fault.SENSORS_CONTRADICT: lambda run: run(on_receive=drift),
-    Fault.MOTION_OUTSIDE_SET: lambda run: run(options="k_m=0.06,f_v=1e-6,T_c=2e-4"),
-    Fault.WRONG_POLARITY: lambda run: run(on_receive=changing(saying(Angle=lambda x: -x, Velocity=lambda v: -v))),
-    Fault.NODE_STOPPED: lambda run: run(on_receive=at_period(200, stop)),
-    Fault.NOT_OBEYED: lambda run: run(on_receive=deafen),
-    Fault.FOREIGN_COMMAND: lambda run: run(on_receive=intruding()),
-    Fault.POLICY_NOT_FINITE: lambda run: run(lambda _a, _v, k: math.nan if k == 120 else 4.0),
-    Fault.POLICY_BEYOND_CONTRACT: lambda run: run(lambda _a, _v, k: 1e9 if k == 120 else 4.0),
-    Fault.GUARD_REJECTED: an_error_before_the_guard,
-    Fault.BUS_LOST: lambda run: run(on_send=failing(BusError, 99)),
-    Fault.INTERRUPTED: lambda run: run(stop_requested=asked_often(700)),
-    Fault.INTERNAL: lambda run: run(lambda _a, _v, k: 1.0 / (k - 150.0)),
-    Fault.CURRENT_MISMATCH: lambda run: run(lambda *_: 3.0, on_receive=later(VELOCITY, 200, AppliedCurrent=0.5)),
-    Fault.WATCHDOG_TRIPPED: lambda run: run(pulse=Pulse(trips_at=1500)),
-    Fault.WATCHDOG_LOST: lambda run: run(pulse=Pulse(silent_at=150)),
-    Fault.NOT_HOME: lambda run: run(lambda *_: 0.0, homing=True, steps=30, angle=40.0),
-    Fault.DEVICE_TIME: lambda run: run(on_receive=later(ANGLE, 200, DeviceTime=lambda time: time + 0.5)),
-    Fault.INCOMPLETE: lambda run: run(on_receive=dropping(ANGLE, MISSING_21_PERCENT)),
-    Fault.NODE_CHANGED: lambda run: run(on_receive=later(STATUS, 200, BenchIdentity=lambda number: int(number) ^ 1)),
-    Fault.MOTION_UNEXPLAINED: lambda run: run(
-        lambda _x, _v, step: 6.0 if step // 60 % 2 == 0 else -6.0,
-        on_receive=later(VELOCITY, 0, AppliedCurrent=lambda current: current + 0.4),
-    ),
-    Fault.RESPONSE_LATE: lambda run: run(options="plant=lag"),
-    Fault.NOT_AT_REST: lambda run: run(on_receive=later(VELOCITY, 520, NodeState=NodeState.FAULT)),
-    # What passes by itself.
-    Fault.SENSOR_LATE: lambda run: run(on_receive=dropping(VELOCITY, range(100, 106))),
-    Fault.SEND_QUEUE_FULL: lambda run: run(on_send=failing(TransmitQueueFullError, 100, 200, 201)),
-    Fault.FRAMES_DROPPED: lambda run: run(
-        on_receive=changing(lambda frame: frame._replace(dropped=7), periods=range(200, 10_000))
-    ),
-    Fault.BUS_ERRORS: lambda run: run(on_receive=changing(reported, VELOCITY, range(200, 203))),
-    Fault.PERMISSION_LOST: lambda run: run(on_receive=dropping(STATUS, range(100, 300))),
-}
-"""A whole run with each fault in it."""
+from tests.scenarios.injections import ANGLE, STATUS, Pulse, changing, saying
+from tests.scenarios.table import IN_LOOP, loop_run
 
 
 def test_a_node_that_sends_the_velocity_first_is_there_and_not_ready(simulate: Simulate) -> None:
@@ -264,19 +41,18 @@ def test_a_node_that_sends_the_velocity_first_is_there_and_not_ready(simulate: S
     assert run.sent == []
 
 
-def test_every_fault_has_an_injection() -> None:
-    assert set(INJECTIONS) == set(Fault)
+BY_FAULT = {scenario.fault: name for name, scenario in IN_LOOP.items()}
 
 
-LATCHED = [fault for fault, info in FAULTS.items() if info.latched]
-SOFT = [fault for fault, info in FAULTS.items() if not info.latched]
+def test_every_fault_has_a_scenario() -> None:
+    assert BY_FAULT.keys() == {None, *Fault}
 
 
-@pytest.mark.parametrize("fault", LATCHED, ids=lambda fault: fault.name)
+@pytest.mark.parametrize("fault", [f for f, info in FAULTS.items() if info.latched], ids=lambda fault: fault.name)
 def test_every_fault_that_latches_ends_the_run_with_stop_frames_and_within_limits(
     fault: Fault, simulate: Simulate, layout: Layout
 ) -> None:
-    run = INJECTIONS[fault](simulate)
+    run = loop_run(BY_FAULT[fault], simulate)
     assert run.outcome.fault is fault, run.outcome.detail
     assert fault.name in run.journal.codes
     assert run.journal.codes[-1] == "OVER"
@@ -299,9 +75,9 @@ def test_every_fault_that_latches_ends_the_run_with_stop_frames_and_within_limit
     assert FAULTS[fault].exit_code in (3, 4, 8)
 
 
-@pytest.mark.parametrize("fault", SOFT, ids=lambda fault: fault.name)
+@pytest.mark.parametrize("fault", [f for f, info in FAULTS.items() if not info.latched], ids=lambda fault: fault.name)
 def test_every_soft_fault_is_told_and_ends_nothing_by_itself(fault: Fault, simulate: Simulate, layout: Layout) -> None:
-    run = INJECTIONS[fault](simulate)
+    run = loop_run(BY_FAULT[fault], simulate)
     assert fault.name in run.journal.codes
     assert run.outcome.fault in (None, Fault.NODE_STOPPED)  # the node ends it where nobody may command it for long
     assert (run.outcome.fault is None) == (fault is not Fault.PERMISSION_LOST)
@@ -311,7 +87,7 @@ def test_every_soft_fault_is_told_and_ends_nothing_by_itself(fault: Fault, simul
 
 
 def test_a_command_without_room_is_lost_and_never_sent_later(simulate: Simulate, layout: Layout) -> None:
-    run = INJECTIONS[Fault.SEND_QUEUE_FULL](simulate)
+    run = loop_run("queue", simulate)
     assert (run.outcome.counters.not_taken, run.outcome.counters.unanswered) == (3, 3)
     assert run.journal.codes.count(Fault.SEND_QUEUE_FULL.name) == 3
     sent = commands(run, layout)

@@ -16,7 +16,8 @@ from emb_runtime.safety.state_machine import Fault
 
 from tests.conftest import FunctionActor, Journal, Simulate, make_loop  # isort: skip
 from tests.benches import SENSOR_BENCH
-from tests.runtime.control.test_faults import INJECTIONS, Pulse
+from tests.scenarios.injections import Pulse
+from tests.scenarios.table import IN_LOOP, loop_run
 
 STEPS = 200
 
@@ -88,8 +89,8 @@ def assert_inputs_suffice(journal: Journal, law: Any, steps: int, on_bench: Any 
     assert list(map(repr, again)) == list(map(repr, journal.records))  # repr, because NaN is not equal to NaN
 
 
-@pytest.mark.parametrize("fault", sorted(INJECTIONS.keys() - {Fault.GUARD_REJECTED}), ids=lambda fault: fault.name)
-def test_the_inputs_of_a_run_make_each_of_its_records_again(fault: Fault, simulate: Simulate) -> None:
+@pytest.mark.parametrize("name", sorted(IN_LOOP.keys() - {"unguarded"}))
+def test_the_inputs_of_a_run_make_each_of_its_records_again(name: str, simulate: Simulate) -> None:
     given: dict[str, Any] = {}
     journal = Journal()
 
@@ -97,7 +98,7 @@ def test_the_inputs_of_a_run_make_each_of_its_records_again(fault: Fault, simula
         given.update(law=law, **arguments)
         return simulate(law, journal=journal, **arguments)
 
-    run = INJECTIONS[fault](record)
+    run = loop_run(name, record)
     core = {"homing": True} if given.get("homing") else {}
     assert_inputs_suffice(journal, given["law"], given.get("steps", run.bench.timing.horizon), run.bench, **core)
 
@@ -123,8 +124,8 @@ def test_what_the_driver_did_is_in_the_journal_call_by_call(simulate: Simulate) 
 
 
 def test_an_answer_that_was_lost_says_why_and_one_that_was_left_was_not_sent(simulate: Simulate) -> None:
-    for fault, texts in ((Fault.SEND_QUEUE_FULL, 3), (Fault.PERMISSION_LOST, 0)):
-        run = INJECTIONS[fault](simulate)
+    for name, texts in (("queue", 3), ("no_status", 0)):
+        run = loop_run(name, simulate)
         inputs = [record for record in run.journal.records if isinstance(record, InputRecord)]
         unsent = [record for record in inputs if record.call == Call.ANSWER and not record.send_time_ns]
         assert len(unsent) == run.outcome.counters.unanswered > 0
@@ -148,7 +149,7 @@ def test_a_sample_is_answered_once_and_without_one_nothing_is(simulate: Simulate
 
 
 def test_a_fault_is_latched_before_the_first_stop_frame_and_explained_after_it(simulate: Simulate) -> None:
-    journal = INJECTIONS[Fault.INTERNAL](simulate).journal
+    journal = loop_run("program", simulate).journal
     inputs = [record for record in journal.records if isinstance(record, InputRecord)]
     at = next(n for n, record in enumerate(inputs) if record.call == Call.LATCH)
     assert [Call(record.call).name for record in inputs[at : at + 3]] == ["LATCH", "STOP_FRAME", "EXPLAIN"]

@@ -1,112 +1,26 @@
 """No run with a node that lies is called done, or what it could lie is too little to matter.
 
-The node is written anew (:mod:`tests.lying.node`), the loop is the one that ships, on a bus whose time is simulated.
-Each time to detection below is a bound in periods of one millisecond, from the first lie to the first stop frame.
+Each time to detection is a bound in periods of one millisecond, from the first lie to the first stop frame.
 """
 
 from __future__ import annotations
 
 import random
-from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
-from emb_bench.sim.transport import SteppedClock
 from emb_runtime.can.messages import bench_identity
-from emb_runtime.config.bench import Bench, load_bench
-from emb_runtime.control.actor import Actor
-from emb_runtime.control.result import Outcome
 from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
 from emb_runtime.records import Frame
 from emb_runtime.safety.state_machine import FAULTS, Fault
 from tests.conftest import FunctionActor, Journal, make_loop
 from tests.lying.node import COMMAND, HONEST, PERIOD_NS, Lie, LyingNode
+from tests.scenarios.lies import BENCH, ENDS, SENSORS, UNEXPLAINED, LyingBus, Seen, assert_inside, run
 
-BENCH = load_bench()
 IDENTITY = bench_identity(BENCH.identity_hash)
-
-
-class LyingBus:
-    """The lying node in lock-step with simulated time.
-
-    Args:
-        node: the node.
-        delay_ns: latency of the frames of the next period [ns]; late frames come in order.
-    """
-
-    def __init__(self, node: LyingNode, delay_ns: Callable[[], int]) -> None:
-        self.node = node
-        self.clock = SteppedClock(10**12)
-        self.stopped: int | None = None
-        """Period of the first stop frame."""
-        self._delay_ns = delay_ns
-        self._tick_ns = self.clock.now_ns() + PERIOD_NS
-        self._last_ns = 0
-        self._queue: deque[Frame] = deque()
-
-    def send(self, frame: Frame) -> None:
-        if not frame.data[4] & 1 and self.stopped is None:
-            self.stopped = self.node.periods
-        self.node.receive(frame.identifier, frame.data)
-        self._queue.appendleft(frame._replace(time_ns=self.clock.now_ns(), own=True))
-
-    def receive(self, deadline_ns: int) -> Frame | None:
-        while self._tick_ns <= max(deadline_ns, self.clock.now_ns()):
-            if self._queue and self._queue[0].time_ns < self._tick_ns:
-                break
-            # What is late for the bus is late for this computer as well: the node goes on meanwhile.
-            arrival_ns = max(self._tick_ns + self._delay_ns(), self._last_ns)
-            self._last_ns = arrival_ns
-            self._queue.extend(Frame(i, data, arrival_ns) for i, data in self.node.tick())
-            self._tick_ns += PERIOD_NS
-        if self._queue and self._queue[0].time_ns <= max(deadline_ns, self.clock.now_ns()):
-            frame = self._queue.popleft()
-            self.clock.advance_to(max(frame.time_ns, self.clock.now_ns()))
-            return frame
-        self.clock.advance_to(max(deadline_ns, self.clock.now_ns()))
-        return None
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What came of a run."""
-
-    outcome: Outcome
-    node: LyingNode
-    journal: Journal
-    detected: int | None  # Periods from the first lie to the first stop frame
-
-
-def run(
-    lie: Lie,
-    seed: int = 1,
-    delay_ns: Callable[[], int] = lambda: 0,
-    law: Callable[[float, float, float], float] = lambda *_: 6.0,
-    steps: int = BENCH.timing.horizon,
-    bench: Bench = BENCH,
-    actor: Actor | None = None,
-    **core: Any,
-) -> Seen:
-    node = LyingNode(bench_identity(bench.identity_hash), lie, seed)
-    bus, journal = LyingBus(node, delay_ns), Journal()
-    driven: Any = {
-        "send": bus.send,
-        "receive": bus.receive,
-        "now_ns": bus.clock.now_ns,
-        "push": journal.push,
-    }
-    outcome = make_loop(bench, actor or FunctionActor(law), steps, **driven, **core).run()
-    detected = None if bus.stopped is None or node.began is None else bus.stopped - node.began
-    return Seen(outcome, node, journal, detected)
-
-
-def assert_inside(seen: Seen) -> None:
-    assert seen.node.lowest >= -10.0
-    assert seen.node.highest <= 100.0
-    assert seen.node.fastest <= 500.0
 
 
 def assert_ends(seen: Seen, fault: Fault, within: int) -> None:
@@ -125,29 +39,16 @@ def test_an_honest_node_completes_its_experiment() -> None:
     assert_inside(seen)
 
 
+@pytest.mark.parametrize("name", ENDS)
+def test_a_lie_that_samples_show_ends_the_run_in_time_and_below_every_limit(name: str) -> None:
+    end = ENDS[name]
+    seen = run(end.lie)
+    assert seen.outcome.fault in end.faults, seen.outcome.detail
+    assert end.says in seen.outcome.detail
+    assert_ends(seen, seen.outcome.fault, end.within)
+
+
 # --- device time ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("lie", "within"),
-    [
-        (Lie(clock_jump=0.5, begin=0.15), 1),  # once called done, with 101 of 500 samples
-        (Lie(clock_jump=0.013, clock_jump_angle=-5.0, begin=0.15), 6),  # once hid an angle of 5 rad
-        (Lie(clock_jump=0.013, begin=0.15), 1),
-        (Lie(clock_jump=0.004), 6),
-        (Lie(clock_random=2.0), 20),
-        (Lie(clock_random=0.01), 20),
-        (Lie(clock_random=0.001), 20),
-    ],
-    ids=[*("0.5s", "13ms-and-5rad", "13ms", "4ms", "random-2s", "random-10ms", "random-1ms")],
-)
-def test_a_device_time_that_jumps_ends_the_run(lie: Lie, within: int) -> None:
-    seen = run(lie)
-    noticed = (Fault.DEVICE_TIME, Fault.FRAMES_REJECTED, Fault.SENSOR_LOST, Fault.SENSORS_CONTRADICT)
-    assert seen.outcome.fault in noticed, seen.outcome.detail
-    assert seen.detected is not None
-    assert seen.detected <= within
-    assert_inside(seen)
 
 
 @pytest.mark.parametrize(("sign", "window", "words"), [(1, 3, "it has gained 2."), (-1, 43, "it has lost")])
@@ -249,48 +150,6 @@ def test_more_than_a_fifth_of_the_pairs_missing_ends_the_run_and_a_tenth_does_no
     assert nth < 10 or outcome.counters.missed in (49, 50)
 
 
-# --- what the node is -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("lie", "within", "words"),
-    [
-        (Lie(idle=True), 1, "the node's state is IDLE after it has obeyed"),
-        (Lie(idle=True, duty=0.1), 1, "the node's state is IDLE after it has obeyed"),
-        (Lie(idle=True, begin=0.0), 1, "the node's state is IDLE after it has obeyed"),
-        (Lie(identity=1), 101, "another bench file"),
-        (Lie(protocol=1), 101, "it speaks protocol 2, expected 1"),
-    ],
-    ids=["idle", "idle-a-tenth", "idle-from-the-start", "identity", "protocol"],
-)
-def test_a_node_that_is_not_what_it_was_ends_the_run(lie: Lie, within: int, words: str) -> None:
-    seen = run(lie)
-    assert_ends(seen, Fault.NODE_CHANGED, within)
-    assert words in seen.outcome.detail
-
-
-# --- sensors that contradict the motion -----------------------------------------------------------------------------
-
-SENSORS = (Fault.SENSORS_CONTRADICT, Fault.MOTION_OUTSIDE_SET, Fault.WRONG_POLARITY, Fault.FRAMES_REJECTED)
-
-
-def test_an_angle_that_drifts_beside_the_velocity_and_a_velocity_that_is_off_end_the_run() -> None:
-    drifts = ((5.0, 80), (30.0, 12), (100.0, 8))
-    lies = [(Lie(drift=sign * drift, begin=0.1), within) for drift, within in drifts for sign in (1.0, -1.0)]
-    lies += [(Lie(offset=offset, begin=0.1), 30) for offset in (40.0, -10.0, 5.0, -5.0)]
-    for lie, within in lies:
-        seen = run(lie)
-        assert seen.outcome.fault in SENSORS, (lie, seen.outcome.detail)
-        assert seen.detected is not None
-        assert seen.detected <= within, lie
-        assert_inside(seen)
-
-
-@pytest.mark.parametrize(("scale", "within"), [(0.2, 14), (0.3, 17), (0.33, 23), (2.0, 5)])
-def test_a_scale_of_both_sensors_that_no_brake_of_the_set_explains_ends_the_run(scale: float, within: int) -> None:
-    assert_ends(run(Lie(scale=scale, begin=0.0)), Fault.MOTION_OUTSIDE_SET, within)
-
-
 @pytest.mark.parametrize("lie", [Lie(motor=-1, begin=0.0), Lie(sensors=-1, begin=0.0)], ids=["motor", "sensors"])
 def test_a_wrong_polarity_is_noticed_before_anything_is_fast(lie: Lie) -> None:
     seen = run(lie)
@@ -326,31 +185,6 @@ def test_a_sensor_that_lies_now_and_then_never_drives_the_brake_out_of_its_limit
     assert seen.outcome.fault in (None, Fault.INCOMPLETE, *SENSORS), seen.outcome.detail
     assert seen.outcome.fault is not None or seen.outcome.counters.rejected > 0 or percent == 10
     assert_inside(seen)
-
-
-# --- what changes slowly or is wrong from the start: a whole run judged ---------------------------------------------
-
-UNEXPLAINED: dict[str, Lie] = {
-    "scale slides by 0.5/s": Lie(slide=0.5, blind=True, begin=0.0),
-    "scale slides by -0.5/s": Lie(slide=-0.5, blind=True, begin=0.0),
-    "scale swings": Lie(wave=0.1, blind=True, begin=0.0),
-    "angle curved": Lie(curve=0.001, blind=True, begin=0.0),
-    "zero at 5 rad": Lie(zero=5.0, blind=True),
-    "zero at -5 rad": Lie(zero=-5.0, blind=True),
-    "both drift by 5 rad/s": Lie(both=5.0, blind=True),
-    "both drift by 5 rad/s with losses": Lie(both=5.0, blind=True, lost=0.05),
-    "current times 0.8": Lie(gain=0.8),
-    "current times 1.05": Lie(gain=1.05),
-    "current grows by -0.5/s": Lie(gain_rate=-0.5),
-    "current swings": Lie(gain_wave=0.1, begin=0.0),
-    "reported current -0.4 A": Lie(reported=-0.4, begin=0.0),
-    "reported current +0.1 A": Lie(reported=0.1, begin=0.0),
-    "unreported current 0.4 A": Lie(offset_current=0.4, begin=0.0),
-    "dead band of 1 A": Lie(dead=1.0, begin=0.0),
-    "friction doubles": Lie(friction_rate=1.0, begin=0.0),
-    "stiffness halves": Lie(stiffness=0.5, begin=0.25),
-}
-"""All of these were called done with exit code 0; the shipped actor drives. tests/searches/lies.py plays 64."""
 
 
 @pytest.fixture(scope="module")

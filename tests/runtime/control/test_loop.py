@@ -18,7 +18,9 @@ from emb_runtime.safety.state_machine import Fault
 
 from tests.conftest import SimRun, Simulate  # isort: skip
 
-from .test_faults import assert_within_limits, changing, commands, dropping, saying
+from tests.scenarios.injections import changing, dropping, saying
+
+from .test_faults import assert_within_limits, commands
 
 MS = 1_000_000
 ANGLE, VELOCITY, STATUS, COMMAND = 0x100, 0x101, 0x102, 0x80

@@ -13,8 +13,7 @@ from emb_runtime.safety.state_machine import FAULTS, Fault
 
 from tests.conftest import FunctionActor, Simulate, make_loop  # isort: skip
 from tests.benches import SENSOR_BENCH
-
-from .test_faults import VELOCITY, dropping
+from tests.scenarios.injections import VELOCITY, dropping
 
 MS = 1_000_000
 

@@ -15,8 +15,8 @@ from emb_runtime.safety.state_machine import Fault
 from tests.actors import constant_actor, speed_network
 from tests.conftest import Simulate
 from tests.lying.node import HONEST, Lie
-from tests.runtime.control.test_lies import assert_inside, run
 from tests.runtime.operating import EmbRun
+from tests.scenarios.lies import assert_inside, run
 
 BENCH = load_bench()
 HALF = math.pi / 2
