@@ -5,11 +5,9 @@ import json
 import math
 import struct
 from collections import namedtuple
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
-import cantools.database
-import e2e.p01
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -64,34 +62,23 @@ def with_crc(message: Message, body: bytes) -> Frame:
     return Frame(message.identifier, protected(message.identifier, body))
 
 
-def with_raw(message: Message, name: str, raw: int) -> Frame:
-    """A golden frame with one signal replaced, CRC right."""
-    signal = message.signal(name)
-    word = int.from_bytes(GOLDEN[message.name][2].data, "little")
-    word = word & ~(signal.mask << signal.shift) | (raw & signal.mask) << signal.shift
-    return with_crc(message, word.to_bytes(message.length, "little")[1:])
-
-
 def generic(message: Message) -> Codec:
     """A generated codec of the physical values, by the signals' names."""
     names = [signal.name for signal in message.signals[1:]]
     return generate_codec(message, namedtuple(message.name, names), tuple(map(Field, names)))
 
 
-CODECS = {message.name: generic(message) for message in MESSAGES}
-
-
-def encode(message: Message, values: Mapping[str, float]) -> Frame:
-    return CODECS[message.name].encode(*(values[signal.name] for signal in message.signals[1:]))
+CODECS: dict[int, Codec] = {}  # By the identity of a message
 
 
 def fault_of(message: Message, frame: Frame) -> Fault | None:
     """Why both decoders reject a frame, None if neither does; their values are then equal."""
-    generated, values = outcome(CODECS[message.name].decode, frame), outcome(message.decode, frame)
+    codec = CODECS.get(id(message)) or CODECS.setdefault(id(message), generic(message))
+    generated, values = outcome(codec.decode, frame), outcome(message.decode, frame)
     if isinstance(values, Fault):
         assert generated is values
         return Fault(values)
-    assert generated._asdict() == {name: value for name, value in values.items() if name != "CRC"}
+    assert {"CRC": frame.data[0], **generated._asdict()} == values
     return None
 
 
@@ -100,9 +87,6 @@ def outcome(decode: Callable[[Frame], Any], frame: Frame) -> Any:
         return decode(frame)
     except FrameRejectedError as err:
         return err.fault
-
-
-SIGNALS = [(message, signal) for message in MESSAGES for signal in message.signals if signal.name != "CRC"]
 
 
 def test_frames_have_the_bytes_that_were_worked_out_by_hand() -> None:
@@ -121,57 +105,6 @@ def test_typed_decoders_read_what_the_typed_encoders_wrote() -> None:
     assert LAYOUT.decode_status(GOLDEN["EMB_Status"][2]) == StatusFrame(
         0, NodeState.STOPPING, LAYOUT.protocol_version, StopReason.WATCHDOG, 513, 0xBEEF
     )
-
-
-@pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.name)
-@given(data=st.data())
-@settings(max_examples=50)
-def test_encoding_equals_cantools_and_an_independent_crc(message: Message, data: st.DataObject) -> None:
-    values: dict[str, float] = {}
-    for signal in message.signals[1:]:
-        whole = st.integers(signal.raw_minimum, signal.raw_maximum)
-        values[signal.name] = data.draw(
-            whole if isinstance(signal.factor, int) else st.floats(signal.minimum, signal.maximum), label=signal.name
-        )
-    theirs = DATABASE.encode_message(message.name, values | {"CRC": 0}, strict=True)
-    assert encode(message, values) == with_crc(message, theirs[1:])
-
-
-@pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.name)
-@given(data=st.data())
-@settings(max_examples=50)
-def test_a_frame_with_a_right_crc_decodes_to_its_values_or_is_rejected_as_cantools_would(
-    message: Message, data: st.DataObject
-) -> None:
-    frame = with_crc(message, data.draw(st.binary(min_size=message.length - 1, max_size=message.length - 1)))
-    values = DATABASE.decode_message(message.name, frame.data, decode_choices=False)
-    try:
-        again = DATABASE.encode_message(message.name, values, strict=True)  # refuses values out of range
-    except cantools.database.EncodeError:
-        again = b""
-    if again == frame.data:  # nothing in reserved bits either
-        assert fault_of(message, frame) is None
-        assert message.decode(frame) == values
-    else:
-        assert fault_of(message, frame) in (Fault.COUNTER, Fault.RESERVED, Fault.RANGE)
-
-
-def test_a_value_that_is_not_finite_or_out_of_range_is_never_encoded() -> None:
-    for message, signal in SIGNALS:
-        values = message.decode(GOLDEN[message.name][2])
-        for value in (math.nan, math.inf, -math.inf, 1e9, -1e9, 1e300):
-            with pytest.raises(FrameError, match=rf"{message.name}\.{signal.name}: expected a value from"):
-                encode(message, values | {signal.name: value})
-
-
-def test_the_ends_of_each_range_can_be_encoded_and_the_next_number_cannot() -> None:
-    for message, signal in SIGNALS:
-        values = message.decode(GOLDEN[message.name][2])
-        for end, outward in ((signal.minimum, -math.inf), (signal.maximum, math.inf)):
-            decoded = message.decode(encode(message, values | {signal.name: end}))[signal.name]
-            assert decoded == pytest.approx(end)
-            with pytest.raises(FrameError):
-                encode(message, values | {signal.name: math.nextafter(end, outward)})
 
 
 def test_each_of_all_currents_that_16_bits_can_say_is_within_the_ceiling_or_rejected() -> None:
@@ -259,16 +192,6 @@ def test_no_single_or_double_bit_error_of_any_frame_at_all_can_pass(message: Mes
     assert not any(check(0, pattern.to_bytes(message.length, "little")) for pattern in patterns)
 
 
-@pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.name)
-@given(data=st.data())
-@settings(max_examples=50)
-def test_the_crc_of_any_bytes_is_judged_as_by_an_independent_library(message: Message, data: st.DataObject) -> None:
-    payload = data.draw(st.binary(min_size=message.length, max_size=message.length))
-    fault = fault_of(message, Frame(message.identifier, payload))
-    # The library's check judges the CRC, and refuses the invalid counter as well.
-    assert (fault not in (Fault.CRC, Fault.COUNTER)) == e2e.p01.e2e_p01_check(bytearray(payload), message.data_id)
-
-
 @given(body=st.binary(min_size=7, max_size=7))
 @settings(max_examples=25)
 def test_a_frame_of_one_message_never_passes_for_another(body: bytes) -> None:
@@ -277,61 +200,9 @@ def test_a_frame_of_one_message_never_passes_for_another(body: bytes) -> None:
         assert fault_of(other, Frame(other.identifier, payload)) is Fault.CRC
 
 
-def test_a_frame_is_rejected_for_its_kind_length_counter_and_reserved_bits() -> None:
-    for message in MESSAGES:
-        frame = GOLDEN[message.name][2]
-        for wrong in (
-            frame._replace(identifier=frame.identifier + 16),
-            frame._replace(extended=True),
-            frame._replace(remote=True),
-            frame._replace(error=True),
-        ):
-            assert fault_of(message, wrong) is Fault.KIND
-        payload = frame.data + b"\x00"
-        for length in set(range(9)) - {message.length}:
-            short = Frame(message.identifier, payload[:length].ljust(length, b"\0"))
-            assert fault_of(message, short) is Fault.LENGTH
-        assert fault_of(message, with_raw(message, "Counter", 15)) is Fault.COUNTER
-        word = int.from_bytes(frame.data, "little")
-        reserved = [bit for bit in range(8 * message.length) if message.reserved >> bit & 1]
-        assert len(reserved) == 8 * message.length - sum(s.mask.bit_count() for s in message.signals)
-        for bit in reserved:
-            assert not word >> bit & 1
-            body = (word | 1 << bit).to_bytes(message.length, "little")[1:]
-            assert fault_of(message, with_crc(message, body)) is Fault.RESERVED
-
-
-def test_a_decoded_value_out_of_range_is_rejected_for_it() -> None:
-    for message, signal, raw in [
-        (LAYOUT.angle, "Angle", 8_000_001),
-        (LAYOUT.angle, "Angle", -8_000_001),
-        (LAYOUT.velocity, "Velocity", 8_000_001),
-        (LAYOUT.velocity, "NodeState", 4),
-        (LAYOUT.velocity, "AppliedCurrent", 100_001),
-        (LAYOUT.command, "Answers", 15),
-        (LAYOUT.status, "StopReason", 5),
-        *((message, "Version", version) for message in MESSAGES[4:] for version in (0, 2, 15)),
-    ]:
-        frame = with_raw(message, signal, raw)
-        with pytest.raises(FrameRejectedError, match=f"{message.name}: frame rejected, value out of range: {signal}: "):
-            CODECS[message.name].decode(frame)
-        assert fault_of(message, frame) is Fault.RANGE
-
-
-def test_the_description_says_what_the_dbc_says() -> None:
+def test_the_messages_are_those_of_the_protocol() -> None:
     assert list(LAYOUT.messages) == ["EMB_Command", "EMB_Angle", "EMB_Velocity", "EMB_Status"]
     assert [m.name for m in LAYOUT.known] == [*LAYOUT.messages, "EMB_Charge", "EMB_Gateway", "EMB_Conditions"]
-    for message in MESSAGES:
-        theirs = DATABASE.get_message_by_name(message.name)
-        assert (message.identifier, message.length) == (theirs.frame_id, theirs.length)
-        assert message.cycle_time == pytest.approx((theirs.cycle_time or 0) * 1e-3)
-        for ours, signal in zip(message.signals, theirs.signals, strict=True):
-            assert (ours.name, ours.unit, ours.minimum, ours.maximum) == (
-                *(signal.name, signal.unit or "", signal.minimum, signal.maximum),
-            )
-            assert (ours.raw_minimum, ours.raw_maximum) == (
-                *(signal.scaled_to_raw(end) for end in (signal.minimum, signal.maximum)),
-            )
 
 
 def test_the_charge_is_rounded_to_its_step_and_wraps() -> None:
