@@ -8,7 +8,7 @@ from random import Random
 import pytest
 
 from emb_runtime.can.codec import Message
-from emb_runtime.can.e2e import CounterCheck
+from emb_runtime.can.e2e import CounterCheck, LeakyCount
 from emb_runtime.can.receiver import Reception
 from tests.fuzz import runs
 from tests.fuzz.targets import TARGETS, Played, ViolationError
@@ -45,6 +45,22 @@ def permission_never_ends(patch: Patch) -> None:
     patch.setattr(Reception, "inhibit_reason", lambda *_: "")
 
 
+def a_frame_may_come_again(patch: Patch) -> None:
+    def careless(self: CounterCheck, counter: int) -> int:
+        self.last = counter
+        return 1
+
+    patch.setattr(CounterCheck, "step", careless)
+
+
+def a_bad_frame_costs_one_good_one(patch: Patch) -> None:
+    patch.setattr("emb_runtime.can.e2e.WEIGHT", 1)
+
+
+def nothing_is_forgiven(patch: Patch) -> None:
+    patch.setattr(LeakyCount, "forgive", lambda _: None)
+
+
 def the_slew_is_not_limited(patch: Patch) -> None:
     patch.setattr("emb_runtime.safety.guard.slew_reference", lambda *_: 0.0)
 
@@ -71,6 +87,9 @@ def the_loop_fails_at_what_it_does_not_know(patch: Patch) -> None:
     [
         ("reception", a_rejected_counter_is_stored),
         ("reception", permission_never_ends),
+        ("reception", a_frame_may_come_again),
+        ("reception", a_bad_frame_costs_one_good_one),
+        ("reception", nothing_is_forgiven),
         ("guard", the_slew_is_not_limited),
         ("guard", an_old_sample_is_good_enough),
         ("guard", the_guard_takes_a_29_bit_identifier_for_its_own),
