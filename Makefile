@@ -102,7 +102,7 @@ night: $(VENV)/.dev
 	$(BIN)/python -m tests.searches.broken_files --count 2000
 	$(BIN)/python -m tests.searches.interrupt
 	$(PYTEST) $(PARALLEL) -m compiled tests/compiled --inputs 1000000 --timeout 7200
-	$(BIN)/python -m tools.proof
+	$(BIN)/python -m proof
 	$(BIN)/python -m tests.mutation
 
 # The compiled core lies beside the sources afterwards. Beyond the values, which are compared bit for bit, the compiler may
@@ -180,4 +180,4 @@ study-reproduce: $(VENV)/.dev
 	$(BIN)/python -m studies.thesis trainings --output build/trainings
 
 proof: $(VENV)/.dev
-	$(BIN)/python -m tools.proof
+	$(BIN)/python -m proof

@@ -16,7 +16,7 @@ from pathlib import Path
 from tools.compile_core import MODULES
 
 ROOT = Path(__file__).parents[1]
-FOLDERS = ("runtime", "bench", "train", "export", "studies", "tools", "examples", "benchmarks")
+FOLDERS = ("runtime", "bench", "train", "export", "proof", "studies", "tools", "examples", "benchmarks")
 QUESTIONS = ("What ", "How ", "Whether ", "Who ", "Which ", "Where ", "When ", "Why ", "The same ")
 SIZES = {"README.md": 12_000, "docs/images/*": 150 * 1024, "examples/*.ipynb": 400 * 1024}  # [bytes] at most
 

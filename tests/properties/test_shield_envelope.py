@@ -1,6 +1,6 @@
 """The envelope shield holds the limits for every brake of its set, whatever the policy says: a slice of the search.
 
-``tests/searches/shield.py`` runs it at length; that one period keeps the safe set is proved (``tools/proof``).
+``tests/searches/shield.py`` runs it at length; that one period keeps the safe set is proved (``proof/``).
 """
 
 from __future__ import annotations

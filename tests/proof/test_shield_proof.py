@@ -16,25 +16,25 @@ import pytest
 
 import emb_runtime.safety.shield as shield_module
 import emb_runtime.safety.shield_design as envelope_module
-import tools.proof.cases as cases_module
-import tools.proof.exhaustive as exhaustive_module
-import tools.proof.extensions as extensions_module
-import tools.proof.safety as safety_module
-import tools.proof.successors as successors_module
-import tools.proof.windows as windows_module
+import proof.cases as cases_module
+import proof.exhaustive as exhaustive_module
+import proof.extensions as extensions_module
+import proof.safety as safety_module
+import proof.successors as successors_module
+import proof.windows as windows_module
 from emb_bench.brake.euler import step as euler_step
 from emb_runtime.config.bench import BrakeParameters, Ranges
+from proof.__main__ import main
+from proof.boxes import cover, slack_of
+from proof.cases import Case, case_of, reserve
+from proof.exhaustive import damped_way, interval_law
+from proof.intervals import Boxes, Interval
+from proof.lemmas import BRAKING, judge, lemmas
+from proof.safety import Thrown
+from proof.terms import Facts, lifted_law, prove
 from tests.benches import SENSOR_BENCH
 from tests.laws import with_numbers
 from tests.properties.shield_search import bench_with, damped
-from tools.proof.__main__ import main
-from tools.proof.boxes import cover, slack_of
-from tools.proof.cases import Case, case_of, reserve
-from tools.proof.exhaustive import damped_way, interval_law
-from tools.proof.intervals import Boxes, Interval
-from tools.proof.lemmas import BRAKING, judge, lemmas
-from tools.proof.safety import Thrown
-from tools.proof.terms import Facts, lifted_law, prove
 
 SHIPPED = case_of(SENSOR_BENCH)
 LEMMAS = {lemma.key: lemma for lemma in BRAKING}
@@ -100,13 +100,13 @@ def test_the_lemmas_are_proved(dear: bool) -> None:
 def test_the_command_prints_every_lemma_and_says_by_its_exit_code_whether_all_are_proved(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tools.proof.__main__.lemmas", lambda _: (LEMMAS["L5h"], LEMMAS["L3a"]))
+    monkeypatch.setattr("proof.__main__.lemmas", lambda _: (LEMMAS["L5h"], LEMMAS["L3a"]))
     assert main([]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split("|")[1].strip() for line in lines[2:-2]] == ["L5h", "L3a"]
     assert all("| proved |" in line for line in lines[2:-2])
     assert lines[-2:] == ["", "2 of 2 lemmas are proved for 'drum brake, Guo 2024'"]
-    monkeypatch.setattr("tools.proof.__main__.case_of", lambda _: law_with(damping_velocity=30.0))
+    monkeypatch.setattr("proof.__main__.case_of", lambda _: law_with(damping_velocity=30.0))
     assert main(["--json"]) == 1
     document = json.loads(capsys.readouterr().out)
     assert [(v["key"], v["proved"]) for v in document["lemmas"]] == [("L5h", True), ("L3a", False)]
@@ -369,7 +369,7 @@ def test_a_statement_that_takes_too_many_steps_is_undecided(monkeypatch: pytest.
         facts.claim("cubes", x * x * x, x * x)
 
     assert prove(statement).proved
-    monkeypatch.setattr("tools.proof.terms.STEPS", (1,))
+    monkeypatch.setattr("proof.terms.STEPS", (1,))
     assert prove(statement).breaks == "cubes: undecided"
 
 

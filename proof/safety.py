@@ -17,8 +17,8 @@ from typing import Any
 from emb_bench.brake.euler import step as euler_step
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.safety.shield import damped_current
-from tools.proof.cases import Case, reserve
-from tools.proof.terms import Answer, Facts, Real, Term, lifted_law, prove, together
+from proof.cases import Case, reserve
+from proof.terms import Answer, Facts, Real, Term, lifted_law, prove, together
 
 FULL, DAMPED = "full braking", "damped stop"
 

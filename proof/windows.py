@@ -6,9 +6,9 @@ from typing import Any
 
 from emb_runtime.safety.shield import _braking_window, _highest_current, successor
 from emb_runtime.safety.shield_design import stoppable
-from tools.proof.cases import Case
-from tools.proof.successors import any_box
-from tools.proof.terms import Answer, Facts, Real, Term, lifted_law, prove, together
+from proof.cases import Case
+from proof.successors import any_box
+from proof.terms import Answer, Facts, Real, Term, lifted_law, prove, together
 
 
 def window_is_kept(case: Case) -> Answer:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import Bench
 from emb_runtime.safety.shield_design import ANGLE_PAD, ShieldLaw, make_law
-from tools.proof.terms import Real
+from proof.terms import Real
 
 
 class Case(NamedTuple):

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tools.proof.intervals import Boxes, Floats, Interval
-from tools.proof.symbolic_execution import DeadEnd, walk
+from proof.intervals import Boxes, Floats, Interval
+from proof.symbolic_execution import DeadEnd, walk
 
 Slack = Callable[..., Any]
 """Function of one interval per dimension: the excess over what is required; None where nothing is required."""

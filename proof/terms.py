@@ -16,7 +16,7 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 from emb_runtime.errors import needs
-from tools.proof.symbolic_execution import DeadEnd, Path, lift, walk
+from proof.symbolic_execution import DeadEnd, Path, lift, walk
 
 Real = Any  # A term, or a plain number
 

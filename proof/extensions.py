@@ -19,9 +19,9 @@ from emb_runtime.safety.shield import (
     successor,
 )
 from emb_runtime.safety.shield_design import OVERSHOOT
-from tools.proof.cases import Case
-from tools.proof.successors import any_box
-from tools.proof.terms import Answer, Facts, Real, Term, lifted_law, prove, together
+from proof.cases import Case
+from proof.successors import any_box
+from proof.terms import Answer, Facts, Real, Term, lifted_law, prove, together
 
 FAR = 1e6  # In place of an end of the window that is not examined: cuts nothing off [A]
 

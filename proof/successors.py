@@ -8,8 +8,8 @@ from emb_bench.brake.euler import step as euler_step
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.safety.shield import _moved, _rolled, fastest_next
 from emb_runtime.safety.shield_design import VELOCITY_PAD, unseen
-from tools.proof.cases import Case
-from tools.proof.terms import Answer, Facts, Real, Term, lifted_law, prove, solver_module, together
+from proof.cases import Case
+from proof.terms import Answer, Facts, Real, Term, lifted_law, prove, solver_module, together
 
 AT_ONCE = 0.004
 """Share of the pad that grows with the time in a sample, for a command's rounding; the rest grows with its square."""

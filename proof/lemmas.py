@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
-from tools.proof import exhaustive, extensions, safety, successors, windows
-from tools.proof.boxes import Covered
-from tools.proof.cases import Case
-from tools.proof.terms import Answer
+from proof import exhaustive, extensions, safety, successors, windows
+from proof.boxes import Covered
+from proof.cases import Case
+from proof.terms import Answer
 
 SOLVER, BOXES = "solver", "boxes"
 

@@ -7,10 +7,10 @@ from typing import Any
 
 from emb_runtime.safety.shield import PAST, _braking_window, _highest_current
 from emb_runtime.safety.shield_design import ANGLE_PAD, ShieldLaw, damped_excess, unseen
-from tools.proof.boxes import Covered, Slack, cover
-from tools.proof.cases import Case
-from tools.proof.intervals import Boxes, Interval, greater
-from tools.proof.terms import with_floats
+from proof.boxes import Covered, Slack, cover
+from proof.cases import Case
+from proof.intervals import Boxes, Interval, greater
+from proof.terms import with_floats
 
 MOST = 2_000_000  # Boxes for one lemma
 

@@ -1,4 +1,4 @@
-"""``python -m tools.proof``: check the shield's argument for a bench, and print what came of each lemma."""
+"""``python -m proof``: check the shield's argument for a bench, and print what came of each lemma."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import sys
 from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, EmbError
 from emb_runtime.system.terminal import as_json, complain, mention, show
-from tools.proof.cases import case_of
-from tools.proof.lemmas import BOXES, SOLVER, Verdict, judge, lemmas
+from proof.cases import case_of
+from proof.lemmas import BOXES, SOLVER, Verdict, judge, lemmas
 
-COMMAND = "tools.proof"
+COMMAND = "proof"
 LOOKED = {SOLVER: "paths", BOXES: "boxes"}
 HEAD = "| lemma | statement | by | looked at | result | least slack | s |\n|---|---|---|---|---|---|---|"
 
