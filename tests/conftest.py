@@ -50,8 +50,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """For :mod:`tests.golden.test_golden` and :mod:`tests.compiled.test_same_bits`."""
-    parser.addoption("--update-golden", action="store_true", help="write the golden pages anew")
+    """For :mod:`tests.golden` and :mod:`tests.compiled.test_same_bits`."""
+    parser.addoption("--update-golden", action="store_true", help="write the golden pages and documents anew")
     parser.addoption("--inputs", type=int, default=20_000, help="inputs of each compiled function (default: 20,000)")
 
 

@@ -17,11 +17,8 @@ import pytest
 from emb_bench.cli.design import main as design
 from emb_bench.cli.replay import main as replay
 from emb_bench.report.text import WIDTH
-from emb_runtime.config.bench import shipped_bench_text
 
 from tests.bench.report_pages import read  # isort: skip
-from tests.bench.simulated_logs import WALL, square, write_log  # isort: skip
-from tests.conftest import SimRun, Simulate  # isort: skip
 
 Say = Callable[..., str]
 PAGES = Path(__file__).parent
@@ -44,32 +41,6 @@ SHORT = {
     "design": 14,
 }
 """Pages without ``-v``: as wide as a terminal, and at most so many lines."""
-HOUR = 3_600_000_000_000  # [ns]
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path:
-    """Logs of a good run, of one of another brake, of one that a fault ended, and of one that did not move."""
-    folder = tmp_path_factory.mktemp("golden")
-
-    def fails(angle: float, velocity: float, step: float) -> float:
-        return math.nan if step >= 120 else square(angle, velocity, step)
-
-    def write(name: str, run: SimRun) -> None:
-        """An hour after the one before."""
-        write_log(folder / f"{name}.mcap", run, begun_ns=WALL + HOUR * len(list(folder.glob("*.mcap"))))
-
-    write("good", simulate(square, options="plant=exact,f_v=3e-5,seed=11"))
-    write("again", simulate(square, options="plant=exact,f_v=3e-5,seed=6"))
-    write("third", simulate(square, options="plant=exact,f_v=3e-5,seed=7"))
-    write("worn", simulate(square, options="plant=exact,f_v=3.3e-5,seed=8"))
-    write("other", simulate(square, options="plant=stribeck,seed=4"))
-    write("aborted", simulate(fails, options="plant=exact,seed=5"))
-    write("still", simulate(lambda *_: 0.02, options="plant=exact"))
-    (folder / "broken.mcap").write_bytes(b"no log at all")
-    short = shipped_bench_text().replace("horizon     = 500", "horizon     = 50")
-    (folder / "short.toml").write_text(short, encoding="utf-8")
-    return folder
 
 
 @pytest.fixture
