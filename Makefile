@@ -4,7 +4,7 @@
 # make browser   pages in a real browser: a run on its live page, a report on screen and on paper; needs chromium, pdftotext
 # make night  what takes longer: slow tests, every fault, searches, fuzzing, all mutants
 # make coverage   branch coverage of codec, guard, shield and state machine, which must be 100 %
-# make mutation | mutation-changed   changes one place of them at a time; each change must make a test fail
+# make mutation | mutation-changed   changes one place of them at a time, or of those that differ from BASE (main); each must make a test fail
 # make compiled   the core of the cycle compiled, compared with its sources bit for bit, and run
 # make package   wheels, with the compiled core and without, and sdist: checked, installed in an empty environment, run
 # make job   the job of docs/howto/kernel-with-can.md with the wheels in dist/, in a clean root: its commands and exit codes
@@ -19,6 +19,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 TORCH := $(shell grep '^torch==' constraints.txt)
+BASE ?= main
 WORKERS ?= $(shell n=$$(nproc); echo $$((n < 4 ? n : 4)))
 
 .PHONY: help demo test pytest hil browser night compiled lint coverage mutation mutation-changed package job bench docs clean
@@ -123,7 +124,7 @@ mutation: $(VENV)/.dev
 	$(BIN)/python -m tests.mutation
 
 mutation-changed: $(VENV)/.dev
-	$(BIN)/python -m tests.mutation --changed
+	$(BIN)/python -m tests.mutation --changed $(BASE)
 
 WHEEL_PIP := build/wheel/bin/python -m pip install --disable-pip-version-check --quiet -c constraints.txt
 

@@ -12,17 +12,17 @@ for it, seconds of imports each; mutatest has had no release since 2022.
 Killed: a test fails, the module cannot be imported, the process dies, or it uses up its processor time. Before anything
 is believed, the tests must pass with the module unchanged and fail with every function of it raising.
 
-A module that is judged without a complaint is entered in ``judged.json`` with a digest of what was judged: the modules
-of the safety code, the tests and the list. ``--changed`` judges those whose digest is no longer the entered one.
+``--changed`` judges the modules that differ from a commit (``main``): they, their tests, or what all tests share,
+docstrings and comments apart. Where git does not know the commit all are judged.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
-import hashlib
-import json
+import functools
 import os
+import subprocess
 import sys
 import time
 import tomllib
@@ -57,7 +57,6 @@ TESTS = {
     "drives.time_out_proof": ("test_time_out_proof.py",),
 }
 """The tests of each module of emb_runtime: the fast ones, and none that runs compiled code."""
-JUDGED = Path(__file__).parent / "judged.json"
 EQUIVALENT = Path(__file__).parent / "equivalent.toml"
 
 
@@ -67,16 +66,17 @@ def main() -> int:
     parser.add_argument("modules", nargs="*", metavar="MODULE", help=f"of {', '.join(TESTS)}; all without")
     parser.add_argument("--list", action="store_true", help="print every mutant, and what killed it")
     parser.add_argument("--coverage", action="store_true", help="run these tests once instead, under branch coverage")
-    parser.add_argument("--changed", action="store_true", help="only modules that changed since they were last judged")
+    parser.add_argument(
+        "--changed", nargs="?", const="main", metavar="COMMIT", help="only modules that differ from it (default: main)"
+    )
     options = parser.parse_args()
     if unknown := set(options.modules) - set(TESTS):
         parser.error(f"expected modules of {', '.join(TESTS)}, got {', '.join(sorted(unknown))}")
     os.chdir(ROOT)
     modules = options.modules or list(TESTS)
-    if options.changed:
-        entered = json.loads(JUDGED.read_text(encoding="utf-8"))
-        modules = [module for module in modules if entered.get(module) != digest(module)]
-        print(f"changed since they were judged: {', '.join(modules) or 'none'}", flush=True)
+    if options.changed is not None:
+        modules = [module for module in modules if differs(module, options.changed)]
+        print(f"changed since {options.changed}: {', '.join(modules) or 'none'}", flush=True)
         if not modules:
             return 0
     tests = sorted({test for module in modules for test in tests_of(module)})
@@ -118,27 +118,36 @@ def run(module: str, listed: bool) -> int:
     print(f"{module}: {counted.total()} mutants: {score}; {time.monotonic() - begin:.0f} s", flush=True)
     if missing or counted["survived"] or counted["listed but killed"]:
         return 1
-    entered = json.loads(JUDGED.read_text(encoding="utf-8")) | {module: digest(module)}
-    JUDGED.write_text(json.dumps(entered, indent=1, sort_keys=True) + "\n", encoding="utf-8")
     return 0
 
 
-def digest(module: str) -> str:
-    """SHA-256 of all that a module's verdict depends on, docstrings and comments apart.
+def differs(module: str, commit: str) -> bool:
+    """Whether a module's verdict may be another one than at a commit.
 
-    That is mutation itself, the list, the tests, the judged modules, and the bench and drives that their tests load.
+    It rests on the module, its tests and its entries in the list; on mutation itself, and on the bench and the drives
+    that the tests load.
     """
-    files = [*Path(__file__).parent.glob("*.py"), EQUIVALENT, *(ROOT / name for name in tests_of(module))]
-    files += [*(path_of(name) for name in TESTS), ROOT / RUNTIME / "conftest.py"]
+    files = [path_of(module), *(ROOT / name for name in tests_of(module)), *Path(__file__).parent.glob("*.py")]
     files += [ROOT / f"tests/{name}.py" for name in ("benches", "conftest", "drives", "independent", "laws")]
     files += [path for path in (ROOT / "examples/drives").iterdir() if path.is_file()]
-    files += [path_of("config.bench"), path_of("config.bench").with_suffix(".toml")]
-    return hashlib.sha256("".join(map(_without_words, sorted(files))).encode()).hexdigest()
+    files += [ROOT / RUNTIME / "conftest.py", path_of("config.bench"), path_of("config.bench").with_suffix(".toml")]
+    if any(_without_words(path, path.read_text(encoding="utf-8")) != _at(commit, path) for path in files):
+        return True
+    before = _at(commit, EQUIVALENT)
+    return before is None or equivalents(module) != equivalents(module, before)
 
 
-def _without_words(path: Path) -> str:
+@functools.cache
+def _at(commit: str, path: Path) -> str | None:
+    """A file as it was where a branch left a commit; None where it was not, or git knows neither."""
+    base = subprocess.run(["git", "merge-base", commit, "HEAD"], capture_output=True, text=True, check=False).stdout
+    name = f"{base.strip()}:{path.relative_to(ROOT)}"
+    shown = subprocess.run(["git", "show", name], capture_output=True, text=True, check=False)
+    return _without_words(path, shown.stdout) if base and shown.returncode == 0 else None
+
+
+def _without_words(path: Path, text: str) -> str:
     """A file's text; of a Python file the syntax tree without docstrings."""
-    text = path.read_text(encoding="utf-8")
     if path.suffix != ".py":
         return text
     tree = ast.parse(text)
@@ -154,12 +163,12 @@ def tests_of(module: str) -> list[str]:
     return [f"{RUNTIME}{room}/{name}" for name in TESTS[module]]
 
 
-def equivalents(module: str) -> set[tuple[str, str, str, int]]:
+def equivalents(module: str, text: str | None = None) -> set[tuple[str, str, str, int]]:
     """The mutants of a module that ``equivalent.toml`` lists: where, what was, what it becomes, which of those alike.
 
     The last counts from 1, in the order of the source; 0 for all.
     """
-    text = EQUIVALENT.read_text(encoding="utf-8")
+    text = EQUIVALENT.read_text(encoding="utf-8") if text is None else text
     entries = tomllib.loads(text).get(module, [])
     return {
         (entry["where"], entry["was"], becomes, entry.get("nth", 0))
