@@ -1,8 +1,9 @@
 """Rules of style that ruff and mypy have not; part of ``make lint``: ``python -m tools.style``.
 
-A docstring begins with a noun or a verb, not as a question. Links of the pages at the root lead to files. Pages and
-pictures stay small. The modules that mypyc compiles avoid what it makes something else of: a cached property, which
-would be computed anew each time, and two exceptions caught under one name, which would share the first one's type.
+A docstring begins with a noun or a verb, not as a question. Links of the pages at the root lead to files, promises have
+tests. Pages and pictures stay small. The modules that mypyc compiles avoid what it makes something else of: a cached
+property, which would be computed anew each time, and two exceptions caught under one name, which would share the first
+one's type.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+from tools import promises
 from tools.compile_core import MODULES
 
 ROOT = Path(__file__).parents[1]
@@ -66,6 +68,7 @@ def problems(root: Path) -> Iterator[str]:
     for page in sorted(root.glob("*.md")):
         yield from link_problems(page)
     yield from size_problems(root)
+    yield from promises.problems(root)
     for module in MODULES:
         yield from compiled_problems(root.joinpath("runtime", "emb_runtime", *module.split(".")).with_suffix(".py"))
 

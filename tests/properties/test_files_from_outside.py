@@ -1,19 +1,27 @@
-"""Whatever a path that is typed leads to: one line on the error stream, the documented exit code, and no waiting."""
+"""Whatever a path that is typed leads to: one line on the error stream, the documented exit code, no waiting.
+
+No code either: nothing that is read is executed.
+"""
 
 from __future__ import annotations
 
+import ast
 import errno
+import inspect
 import os
 from pathlib import Path
 
 import pytest
 
+from emb_runtime.can.messages import load_layout
 from emb_runtime.system.entry import start
 from emb_runtime.system.input_file import _Regular
 from tests.bench.simulated_logs import square, write_log
 from tests.conftest import Simulate
 from tests.test_cases import PROGRAMS
 
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("runtime/emb_runtime", "bench/emb_bench", "train/emb_train", "export/emb_export")
 COMMANDS = {
     "emb-run --iface sim --log new.mcap --policy {}": {2, 5},
     "emb-run --iface sim --log new.mcap --bench {}": {2},
@@ -80,3 +88,28 @@ def test_whatever_the_path_leads_to_one_line_says_so(
     assert said.splitlines()[-1].startswith(program), said
     assert "Traceback" not in said
     assert sorted(Path().iterdir()) == before
+
+
+RUNS = {"eval", "exec", "compile", "__import__"}
+UNPICKLES = {"pickle", "marshal", "shelve", "dill", "joblib", "cloudpickle"}
+KNOWN = {
+    ("can/generated.py", "exec"),  # functions made from the package's own DBC: load_layout() takes no file
+    ("policy/trial.py", "pickle.loads"),  # the bench, from the parent, which made it
+}
+
+
+def test_no_module_executes_or_unpickles_what_it_reads() -> None:
+    found = set()
+    for path in (file for package in PACKAGES for file in (ROOT / package).rglob("*.py")):
+        for call in (n for n in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(n, ast.Call)):
+            name = ast.unparse(call.func)
+            unpickles = name.split(".")[0] in UNPICKLES and name.split(".")[-1] in (
+                "load",
+                "loads",
+                "Unpickler",
+                "open",
+            )
+            if name in RUNS or unpickles or any(word.arg == "allow_pickle" for word in call.keywords):
+                found.add((f"{path.parent.name}/{path.name}", name))
+    assert found == KNOWN
+    assert not inspect.signature(load_layout).parameters
