@@ -8,7 +8,7 @@
 # make compiled   the core of the cycle compiled, compared with its sources bit for bit, and run
 # make package   wheels, with the compiled core and without, and sdist: checked, installed in an empty environment, run
 # make job   the job of docs/howto/kernel-with-can.md with the wheels in dist/, in a clean root: its commands and exit codes
-# make lint | bench | docs | clean
+# make lint | docs | clean
 # make study-thesis | study-reproduce   the thesis's analysis, its trainings (hours), into build/
 # make figures   the rows of docs/figures.md, measured anew (a day)
 # make proof   the shield's argument checked by machine for every brake of the set
@@ -22,7 +22,7 @@ TORCH := $(shell grep '^torch==' constraints.txt)
 BASE ?= main
 WORKERS ?= $(shell n=$$(nproc); echo $$((n < 4 ? n : 4)))
 
-.PHONY: help demo test pytest hil browser night compiled lint coverage mutation mutation-changed package job bench docs clean
+.PHONY: help demo test pytest hil browser night compiled lint coverage mutation mutation-changed package job docs clean
 
 help:
 	@sed -n '/^$$/q; s/^# //p' Makefile
@@ -50,7 +50,7 @@ $(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python
 
 # The site's modules are read, not imported.
 $(VENV)/.docs: pyproject.toml constraints.txt | $(BIN)/python
-	@echo "installing mkdocs into $(VENV): about a minute ..."
+	@echo "installing mkdocs into $(VENV): half a minute ..."
 	$(PIP) -e '.[docs]'
 	@touch $@
 
@@ -155,9 +155,6 @@ package: $(VENV)/.dev
 
 job: $(VENV)/.dev
 	$(BIN)/python .ci/job.py dist
-
-bench: $(VENV)/.dev
-	@set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python "$$file"; done
 
 clean:
 	rm -rf $(VENV) build dist demo .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage
