@@ -28,7 +28,7 @@ from mkdocs.structure.pages import Page
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("runtime/emb_runtime", "bench/emb_bench", "train/emb_train", "export/emb_export")
 MODULES = "reference/modules/"
-HELP_WIDTH = "100"  # Columns of the ``--help`` texts
+HELP_WIDTH = "80"  # Columns of the ``--help`` texts, as in a terminal
 
 
 class PlainReferences(griffe.Extension):
@@ -115,7 +115,7 @@ def commands_page() -> str:
     lines = ["# Commands\n", "The `--help` of each command, as this version prints it.\n"]
     for name, parser in command_parsers().items():
         for title, text in helps(name, parser):
-            lines += [f"{'###' if ' ' in title else '##'} {title}\n", f"```text\n{text}```\n"]
+            lines += [f"{'###' if ' ' in title else '##'} {title}\n", f"``` {{.text .help}}\n{text}```\n"]
     return "\n".join(lines)
 
 
