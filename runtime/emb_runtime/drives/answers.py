@@ -108,7 +108,7 @@ class Answers:
 
     def _conditions_frames(self) -> list[Frame]:
         """The frame of the conditions, once both have come, and if their signals carry them."""
-        message = self._layout.conditions
+        message = self._layout.optional["EMB_Conditions"]
         signals = message.signal("Temperature"), message.signal("SupplyVoltage")
         temperature, voltage = (self.conditions.get(name, math.nan) for name in ("temperature", "supply_voltage"))
         if not all(s.minimum <= v <= s.maximum for s, v in zip(signals, (temperature, voltage), strict=True)):

@@ -383,7 +383,8 @@ def test_conditions_go_to_the_host_with_a_status_once_both_have_come(
     played.drive.waiting += [Frame(0x015, struct.pack("<ff", 0.0, value)) for value in temperatures]
     played.drive.waiting += [Frame(0x017, struct.pack("<ff", value, 0.0)) for value in voltages]
     sent += [f for _ in range(200) for f in played.period()]
-    shown = [LAYOUT.conditions.decode(f) for f in sent if f.identifier == LAYOUT.conditions.identifier]
+    message = LAYOUT.optional["EMB_Conditions"]
+    shown = [message.decode(f) for f in sent if f.identifier == message.identifier]
     assert [(row["Temperature"], row["SupplyVoltage"]) for row in shown] == told  # in whole steps
     assert [row["Counter"] for row in shown] == [*range(len(told))]
 
