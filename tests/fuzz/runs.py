@@ -24,8 +24,7 @@ from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.state_machine import Fault
 from tests.conftest import Journal, make_loop
 from tests.fuzz.model import ReceptionModel
-from tests.fuzz.stream import ANGLE, COMMAND, MS, STATUS, anything, chance, damaged
-from tests.fuzz.targets import Played, demand
+from tests.fuzz.stream import ANGLE, COMMAND, MS, STATUS, Played, anything, chance, damaged, demand
 from tests.independent import read
 
 BENCH, LAYOUT = load_bench(), load_layout()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from random import Random
+from typing import NamedTuple
 
 from emb_runtime.can.messages import StopReason, load_layout
 from emb_runtime.records import Frame, NodeState
@@ -12,6 +13,23 @@ from tests.independent import MESSAGES, protected
 LAYOUT = load_layout()
 MS = 1_000_000
 COMMAND, ANGLE, VELOCITY, STATUS = 0x080, 0x100, 0x101, 0x102
+
+
+class Played(NamedTuple):
+    """What a sequence was."""
+
+    items: int  # Frames or events
+    commands: int = 0  # Commands that reached the bus, each of them judged
+
+
+class ViolationError(AssertionError):
+    """Something that must not be."""
+
+
+def demand(holds: bool, *what: object) -> None:
+    """Raise a :class:`ViolationError` unless it holds."""
+    if not holds:
+        raise ViolationError(" ".join(map(str, what)))
 
 
 def chance(draw: Random, percent: int) -> bool:

@@ -11,7 +11,8 @@ from emb_runtime.can.codec import Message
 from emb_runtime.can.e2e import CounterCheck, LeakyCount
 from emb_runtime.can.receiver import Reception
 from tests.fuzz import runs
-from tests.fuzz.targets import TARGETS, Played, ViolationError
+from tests.fuzz.stream import Played, ViolationError
+from tests.fuzz.targets import TARGETS
 
 PLAYED: dict[str, tuple[Callable[[Random], Played], int]] = {
     **{name: (target, 12) for name, target in TARGETS.items()},

@@ -26,7 +26,8 @@ from emb_runtime.can.messages import load_layout
 from emb_runtime.records import Frame
 from tests.fuzz import runs
 from tests.fuzz.runs import HangError
-from tests.fuzz.targets import TARGETS, Played, ViolationError
+from tests.fuzz.stream import Played, ViolationError
+from tests.fuzz.targets import TARGETS
 from tests.independent import protected
 
 LAYOUT = load_layout()

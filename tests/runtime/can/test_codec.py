@@ -160,6 +160,7 @@ def test_the_ends_of_each_range_can_be_sent_and_believed_and_nothing_beyond_them
         ours = coding.ours.signal(signal.name)
         assert (ours.unit, ours.minimum, ours.maximum) == (signal.unit or "", signal.minimum, signal.maximum)
         assert (ours.raw_minimum, ours.raw_maximum) == (low, high)
+        assert isinstance(ours.factor, int) == float(signal.scale).is_integer()  # the values of a whole step are whole
         for end in (signal.minimum, signal.maximum):
             frame = coding.encode(values | {signal.name: end})
             assert coding.ours.decode(frame)[signal.name] == pytest.approx(end)
@@ -194,7 +195,9 @@ def test_a_frame_is_rejected_for_its_kind_its_length_and_each_bit_that_no_signal
         wrong = frame._replace(data=frame.data[:length].ljust(length, b"\0"))
         assert fault_of(coding.ours, wrong) is Fault.LENGTH
     covered = {bit for s in coding.theirs.signals for bit in range(s.start, s.start + s.length)}
-    for bit in set(range(8 * coding.ours.length)) - covered:
+    reserved = set(range(8 * coding.ours.length)) - covered
+    assert coding.ours.reserved == sum(1 << bit for bit in reserved)
+    for bit in reserved:
         assert fault_of(coding.ours, coding.protected(word | 1 << bit)) is Fault.RESERVED
 
 
@@ -239,7 +242,7 @@ def test_cantools_without_its_package_is_there_for_an_import_only(monkeypatch: p
         monkeypatch.delitem(sys.modules, name)
     assert len(codec_module.parse(text).messages) == len(DATABASE.messages)
     assert "cantools.database.can" in sys.modules
-    assert "cantools" not in sys.modules
+    assert not {"cantools", "cantools.tester"} & sys.modules.keys()  # the package imports its tester
 
 
 @pytest.mark.parametrize("length", range(2, 9))

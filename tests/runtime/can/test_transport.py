@@ -150,48 +150,30 @@ class Rig:
         return False
 
 
-def opening(**state: object) -> str:
-    """What a user reads when this socket cannot be opened."""
-    fake = FakeSocket()
-    for name, value in state.items():
-        setattr(fake, name, value)
-    with pytest.raises(BusError) as caught:
-        SocketCan("can7", SteppedClock(), open_socket=lambda: cast(socket.socket, fake))
-    assert fake.closed
-    return str(caught.value)
-
-
 def test_opening_sets_what_the_loop_relies_on() -> None:
     rig = Rig()
     options = rig.socket.options
-    assert rig.socket.bound == ("vcan0",)
-    assert not rig.socket.blocking
+    assert (rig.bus.name, rig.socket.bound, rig.socket.blocking) == ("vcan0", ("vcan0",), False)
     assert options[socket.SOL_CAN_RAW, socket.CAN_RAW_RECV_OWN_MSGS] == 1
     assert options[socket.SOL_CAN_RAW, ERR_FILTER] == 0x1FFFFFFF
     assert (socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER) not in options
-    assert rig.bus.name == "vcan0"
 
 
-def test_the_receive_buffer_is_forced_where_allowed_and_read_back() -> None:
-    rig = Rig()
-    assert rig.socket.options[socket.SOL_SOCKET, RCVBUFFORCE] == 4 << 20
-    assert (socket.SOL_SOCKET, socket.SO_RCVBUF) not in rig.socket.options
-    assert rig.bus.obtained["receive_buffer"] == "8388608 bytes"
+def test_the_receive_buffer_is_forced_where_allowed_or_what_the_kernel_grants_and_read_back() -> None:
+    for privileged, used, other, granted in (
+        (True, RCVBUFFORCE, socket.SO_RCVBUF, "8388608 bytes"),
+        (False, socket.SO_RCVBUF, RCVBUFFORCE, "425984 bytes"),
+    ):
+        rig = Rig(privileged=privileged)
+        assert rig.socket.options[socket.SOL_SOCKET, used] == 4 << 20
+        assert (socket.SOL_SOCKET, other) not in rig.socket.options
+        assert rig.bus.obtained["receive_buffer"] == granted
 
 
-def test_without_privilege_the_receive_buffer_is_what_the_kernel_grants() -> None:
-    rig = Rig(privileged=False)
-    assert rig.socket.options[socket.SOL_SOCKET, socket.SO_RCVBUF] == 4 << 20
-    assert rig.bus.obtained["receive_buffer"] == "425984 bytes"
-
-
-def test_identifiers_become_exact_kernel_filters() -> None:
+def test_identifiers_become_exact_kernel_filters_and_a_socket_that_only_sends_gets_nothing() -> None:
     filters = Rig(identifiers=(0x100, 0x101)).socket.options[socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER]
     # Mask: 11 identifier bits, and the flags for extended and remote frames.
     assert filters == bytes.fromhex("00010000 ff0700c0 01010000 ff0700c0")
-
-
-def test_a_socket_that_only_sends_has_the_kernel_pass_on_nothing() -> None:
     options = Rig(identifiers=()).socket.options
     assert options[socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER] == b""
     assert options[socket.SOL_CAN_RAW, ERR_FILTER] == 0
@@ -207,17 +189,21 @@ def test_a_kernel_without_can_says_how_to_get_one() -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_an_interface_that_does_not_exist_is_named_with_what_to_do() -> None:
-    assert opening(bind_error=failure(errno.ENODEV)).startswith("can7: no such CAN interface (No such device); ")
-    assert "too long" in opening(bind_error=OSError("AF_CAN interface name too long"))
-
-
-def test_an_interface_that_is_down_is_refused_at_opening() -> None:
-    assert opening(pending_error=errno.ENETDOWN) == "can7: the interface is down; `ip link set can7 up`"
-
-
-def test_a_descriptor_that_select_cannot_take_is_refused() -> None:
-    assert "1024 is too high" in opening(descriptor=1024)
+@pytest.mark.parametrize(
+    ("state", "told"),
+    [
+        ({"bind_error": failure(errno.ENODEV)}, r"^can7: no such CAN interface \(No such device\); "),
+        ({"bind_error": OSError("AF_CAN interface name too long")}, "too long"),
+        ({"pending_error": errno.ENETDOWN}, "^can7: the interface is down; `ip link set can7 up`$"),
+        ({"descriptor": 1024}, "1024 is too high"),  # for select
+    ],
+)
+def test_a_socket_that_cannot_be_used_is_refused_at_opening_with_what_to_do(state: dict[str, Any], told: str) -> None:
+    fake = FakeSocket()
+    vars(fake).update(state)
+    with pytest.raises(BusError, match=told):
+        SocketCan("can7", SteppedClock(), open_socket=lambda: cast(socket.socket, fake))
+    assert fake.closed
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
 from mcap.records import Channel
 from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
 from msgspec import to_builtins
 
 from emb_runtime.can.messages import load_layout
@@ -213,7 +214,7 @@ def test_whatever_writing_raises_the_run_is_told(
     def fail(*_: object, **__: object) -> None:
         raise kind("planted")
 
-    monkeypatch.setattr(recorder_process.Writer, place, fail)
+    monkeypatch.setattr(Writer, place, fail)
     ring.push(*pack(EventRecord(START, "X", "")))
     answer = recording.finish({"exit_reason": "done"})
     assert answer["error"] == f"writing failed: {kind.__name__}: {kind('planted')}"
