@@ -30,7 +30,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.policy.policy import Inference, Policy, load_policy, shipped_actor_path
 from emb_train.closed_loop import Conditions
 from emb_train.intervals import intervals
-from emb_train.play import Estimating, Excitation, Law, Planned, Played, fresh_draws, play
+from emb_train.play import Excitation, Planned, fresh_draws, of_actor, of_currents, of_law, play
 from emb_train.training import load_plan
 
 CLASSICAL = ("square:period=0.36", "constant-speed:turn=0.15", "chirp", "multisine")
@@ -43,12 +43,12 @@ def excitation(name: str, bench: Bench, count: int) -> Excitation:
     if name == RANDOM:
         rng, horizon = np.random.default_rng(0), bench.timing.horizon
         levels = rng.uniform(-bench.limits.current, bench.limits.current, (count, -(-horizon // HELD)))
-        return Played(levels.repeat(HELD, axis=1)[:, :horizon])
+        return of_currents(levels.repeat(HELD, axis=1)[:, :horizon])
     if name in CLASSICAL:
-        return Law(parse_excitation(name, bench).law)
+        return of_law(parse_excitation(name, bench).law)
     if name.endswith(".json"):
-        return Estimating(Planned(load_plan(Path(name)).speeds, bench), bench)
-    return Estimating(load_policy(shipped_actor_path() if name == ACTOR else Path(name), bench), bench)
+        return of_actor(Planned(load_plan(Path(name)).speeds, bench), bench)
+    return of_actor(load_policy(shipped_actor_path() if name == ACTOR else Path(name), bench), bench)
 
 
 def target_speeds(policy: Policy, bench: Bench) -> Floats:

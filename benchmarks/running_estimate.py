@@ -30,7 +30,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Sensors
 from emb_runtime.estimator.estimate import NORMAL_95
 from emb_runtime.estimator.kalman import believed, deviations, fits
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
-from emb_train.closed_loop import Batch, Conditions, state_of
+from emb_train.closed_loop import Batch, Conditions
 from emb_train.play import begin_all, fresh_draws
 
 COUNT = len(PARAMETER_NAMES)
@@ -65,8 +65,8 @@ def results(bench: Bench, quick: bool, declared: float, true: float, count: int,
     for speed in target_speeds(load_policy(shipped_actor_path(quick), bench), bench):
         batch.advance(np.full(count, speed))
         out[batch.experiments.violated, LEFT] = 1.0
-    for row, kept in zip(out, batch.experiments.estimate, strict=True):
-        state = state_of(kept)
+    for row, loop in zip(out, batch.experiments.loops, strict=True):
+        state = loop.estimate
         row[:FITS] = *believed(batch.setup.model, state), *deviations(batch.setup.model, state)
         row[FITS], row[WORST] = fits(state), state.worst
     truths = [[getattr(d.brake, name) / getattr(bench.brake, name) for name in PARAMETER_NAMES] for d in draws]

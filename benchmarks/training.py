@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from emb_bench.config.bench import Bench, load_bench
 from emb_train.env import EmbExcitationVectorEnv
-from emb_train.play import APPLIED, Currents, Excitation, Outcome, Played, Seen, grid_draws, play
+from emb_train.play import APPLIED, Currents, Excitation, Outcome, Seen, grid_draws, of_currents, play
 from emb_train.ppo import DeployedActor, train
 from emb_train.training import Trained, Training, begin_training, load_preset, run_training
 
@@ -139,7 +139,7 @@ def on_grid(trained: Trained, training: Training, bench: Bench) -> dict[str, Out
     blind = {}
     for u in (limit, -limit):
         for t in range(horizon // 100, horizon + 1, horizon // 100):  # the last is no switch at all
-            blind[f"{u:+g} A, from step {t} {-u:+g} A"] = played(Played(np.where(np.arange(horizon) < t, u, -u)))
+            blind[f"{u:+g} A, from step {t} {-u:+g} A"] = played(of_currents(np.where(np.arange(horizon) < t, u, -u)))
     best = max(blind, key=lambda name: float(blind[name].matrices.mean()))
     return {"trained actor": played(Network(DeployedActor(trained.actor, limit))), best: blind[best]}
 

@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from emb_bench.config.bench import Bench, load_bench
 from emb_runtime.errors import UsageError
 from emb_train.closed_loop import Batch
-from emb_train.env import Scoring
 from emb_train.play import Draw, begin_all
 from emb_train.ppo import DeployedActor
-from emb_train.rewards import REWARDS, Reward
+from emb_train.rewards import REWARDS, Reward, transition
 from emb_train.training import BENCH, CONFIGURATION, METRICS, begin_training, load_preset, run_training
 from emb_train.training import Training as Configuration
 
@@ -82,13 +81,14 @@ class Training:
         """
         config, ranges = self.config, self.bench.range_set(self.config.ranges)
         batch = Batch(self.bench, ranges, config.parameters, len(draws), config.plants[0], config.conditions)
-        scoring = Scoring(batch, reward or REWARDS[config.reward])
+        reward = reward or REWARDS[config.reward]
         begin_all(batch, draws)
         over = np.zeros(len(draws), np.bool_)
-        series: tuple[list[Floats], ...] = ([batch.experiments.x[:, :2].copy()], [], [], [])
-        for _ in range(batch.setup.rules.horizon):
-            worth = scoring.advance((wanted or self.agent)(batch))
-            now_all = (batch.experiments.x[:, :2], batch.experiments.past[:, 0], worth, batch.information())
+        series: tuple[list[Floats], ...] = ([batch.x], [], [], [])
+        for _ in range(batch.bench.timing.horizon):
+            batch.advance((wanted or self.agent)(batch))
+            made = transition(batch)
+            now_all = (batch.x, batch.experiments.past[:, 0], reward(made), made.after)
             for kept, now in zip(series, now_all, strict=True):
                 kept.append(np.where(over if now.ndim == 1 else over[:, None], np.nan, now))
             over |= batch.experiments.violated

@@ -29,7 +29,7 @@ ROOMS = {
     "bench/emb_bench": "config documents numbers options compiled output figures parallel brake sim logs experiment "
     "information excitation recordings hil rerun estimate design analysis export report commission live batch "
     "api cli",
-    "train/emb_train": "presets rewards closed_loop intervals lies env play ppo plan training network optimum evaluate "
+    "train/emb_train": "presets closed_loop intervals lies rewards env play ppo plan training network optimum evaluate "
     "cli",
     "export/emb_export": "export",
 }

@@ -14,7 +14,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train.closed_loop import Conditions
 from emb_train.intervals import intervals
-from emb_train.play import MEASURES, Estimating, Played, fresh_draws, play
+from emb_train.play import MEASURES, fresh_draws, of_actor, of_currents, play
 
 from tests.bench.commission.test_steps import LOGS, found, sheet_text  # isort: skip
 from tests.runtime.operating import EmbRun  # isort: skip
@@ -32,11 +32,11 @@ def test_on_brakes_that_it_never_saw_it_returns_within_limits_with_narrower_inte
     bench: Bench,
 ) -> None:
     ranges = bench.range_set("pm50")
-    shipped = Estimating(load_policy(shipped_actor_path(), bench), bench)
+    shipped = of_actor(load_policy(shipped_actor_path(), bench), bench)
     draws = fresh_draws(ranges, 1000, 20)
     actor, push = (
         play(bench, ranges, PARAMETER_NAMES, e, draws, conditions=PHYSICAL)
-        for e in (shipped, Played(np.full(bench.timing.horizon, bench.limits.current)))
+        for e in (shipped, of_currents(np.full(bench.timing.horizon, bench.limits.current)))
     )
     for played in (actor, push):
         assert (int(played.left.sum()), int(played.home.sum())) == (0, len(draws))  # the shield's doing
@@ -58,7 +58,7 @@ OTHER_BENCHES = {
 
 def test_it_runs_on_a_bench_of_ones_own_and_tells_as_much(bench: Bench) -> None:
     ranges, draws = bench.range_set("pm50"), fresh_draws(bench.range_set("pm50"), 5, 4)
-    shipped = Estimating(load_policy(shipped_actor_path(), bench), bench)
+    shipped = of_actor(load_policy(shipped_actor_path(), bench), bench)
     own = MEASURES["D"].values(play(bench, ranges, PARAMETER_NAMES, shipped, draws, conditions=PHYSICAL).matrices)
     for what, changes in OTHER_BENCHES.items():
         text = shipped_bench_text()
@@ -67,7 +67,7 @@ def test_it_runs_on_a_bench_of_ones_own_and_tells_as_much(bench: Bench) -> None:
             text = text.replace(old, new)
         mine = parse_bench(text, what)
         ranges = mine.range_set("pm50")
-        policy = Estimating(load_policy(shipped_actor_path(), mine), mine)
+        policy = of_actor(load_policy(shipped_actor_path(), mine), mine)
         played = play(mine, ranges, PARAMETER_NAMES, policy, fresh_draws(ranges, 5, 4), conditions=PHYSICAL)
         assert (int(played.left.sum()), int(played.home.sum())) == (0, 4), what
         lost = own - MEASURES["D"].values(played.matrices)
@@ -79,13 +79,13 @@ def test_it_runs_with_the_bench_file_that_a_commissioning_writes(tmp_path: Path)
     bench = parse_bench(found_text(sheet, found(sheet), LOGS), "found")
     assert (bench.prior, bench.noise == sheet.noise) == (MEASURED, False)
     ranges = bench.range_set(MEASURED)
-    push = Played(np.full(bench.timing.horizon, bench.limits.current))
+    push = of_currents(np.full(bench.timing.horizon, bench.limits.current))
     for quick in (False, True):
         policy = load_policy(shipped_actor_path(quick), bench)
         assert policy.warnings == ["velocity by sensor, made for one by observer"]
         both = [
             play(bench, ranges, PARAMETER_NAMES, e, fresh_draws(ranges, 5, 4), conditions=PHYSICAL)
-            for e in (Estimating(policy, bench), push)
+            for e in (of_actor(policy, bench), push)
         ]
         for played in both:
             assert (int(played.left.sum()), int(played.home.sum())) == (0, 4)

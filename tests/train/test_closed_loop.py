@@ -20,24 +20,13 @@ from emb_bench.sim.simulated_brake import sent_current
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
-from emb_runtime.safety import response
 from emb_runtime.safety.command_limits import LEFT
-from emb_runtime.safety.response import begin as begin_response
-from emb_runtime.safety.sensor_monitor import begin as begin_monitor
 from emb_runtime.safety.sensor_monitor import largest_current
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST
 from emb_runtime.safety.shield_design import make_law
-from emb_train.closed_loop import (
-    BENCH_CONDITIONS,
-    Batch,
-    Conditions,
-    delayed,
-    monitor_of,
-    store_monitor,
-    store_response,
-)
-from emb_train.play import Played, fresh_draws, play
+from emb_train.closed_loop import BENCH_CONDITIONS, Batch, Conditions, delayed, first_loop
+from emb_train.play import fresh_draws, of_currents, play
 from tests.benches import SENSOR_BENCH, SENSOR_TEXT
 
 BENCH = SENSOR_BENCH
@@ -61,7 +50,7 @@ def test_an_experiment_is_what_the_node_makes_of_the_same_commands(seed: int, de
     batch = Batch(SHORT, PM50, ("f_v",), 1, plant="exact", conditions=with_(command_delay=(delay, delay)))
     batch.begin(0, np.random.default_rng(seed))
     sides = exact.instruments._replace(command_delay=delay)
-    noise = iter([(*errors, 0.0) for errors in batch.experiments.noise[0].tolist()])
+    noise = map(tuple, batch.experiments.noise[0].tolist())
     node = BrakeNode(
         SHORT,
         layout,
@@ -75,12 +64,12 @@ def test_an_experiment_is_what_the_node_makes_of_the_same_commands(seed: int, de
         said, applied = layout.decode_angle(frames[0]), layout.decode_velocity(frames[1])
         assert batch.experiments.y[0, 0] == pytest.approx(said.angle, abs=1e-3)  # the frame's resolution
         assert batch.experiments.y[0, 1] == pytest.approx(applied.velocity, abs=0.05)
-        assert batch.experiments.applied[0] == pytest.approx(applied.applied_current, abs=1.01 * step)
+        assert batch.experiments.applied[0, k] == pytest.approx(applied.applied_current, abs=1.01 * step)
         node.receive(layout.encode_command(k % 15, said.counter, steps[k] * step, True))
         batch.advance(np.array([steps[k] * step]))
         frames = node.tick()
-        assert batch.experiments.x[0, 0] == pytest.approx(node.angle, abs=1e-9)
-        assert batch.experiments.x[0, 1] == pytest.approx(node.velocity, abs=1e-6)
+        assert batch.x[0, 0] == pytest.approx(node.angle, abs=1e-9)
+        assert batch.x[0, 1] == pytest.approx(node.velocity, abs=1e-6)
 
 
 def test_every_delay_comes_equally_often_and_changes_neither_the_brakes_nor_the_noise() -> None:
@@ -117,7 +106,10 @@ def test_information_over_nominal_values_is_that_of_parameters_in_units_of_them(
         batch.begin(i, np.random.default_rng(i))
     for _ in range(40):
         batch.advance(np.full(3, 5.0))
-    for brake, own, seen in zip(batch.experiments.brakes, batch.experiments.m, batch.information(), strict=True):
+    k = batch.experiments.k
+    for brake, own, seen in zip(
+        batch.experiments.brakes, batch.newest(batch.experiments.m), batch.information(k), strict=True
+    ):
         true = dict(zip(BrakeParameters._fields, brake.tolist(), strict=True))
         scale = np.diag([getattr(BENCH.brake, name) / true[name] for name in names])
         np.testing.assert_allclose(unpack(seen, 2), scale @ unpack(own, 2) @ scale, rtol=1e-12)
@@ -132,14 +124,14 @@ def test_the_critic_sees_what_an_experiment_has_of_its_own() -> None:
         batch.advance(np.array([u]))
     told = batch.critic_observation()[0, -7:]
     assert told[0] == 0.5  # its delay of at most 4
-    assert told[1] == pytest.approx(batch.experiments.x[0, 3] / 6.0)
+    assert told[1] == pytest.approx(batch.experiments.x[0, 3, 3] / 6.0)
     assert told[2:] == pytest.approx([1.0, -0.5, 0.25, 0.0, 0.0])
 
 
 def test_the_shield_covers_the_drawn_delay_and_no_more() -> None:
     conditions = Conditions(command_delay=(0, 2))
     for current in (6.0, -6.0):
-        pushing = Played(np.full(500, current))
+        pushing = of_currents(np.full(500, current))
         assert not play(BENCH, PM50, PARAMETER_NAMES, pushing, fresh_draws(PM50, 5, 40), "exact", conditions).left.any()
     plain, late = Conditions().applied(BENCH).shield, Conditions(command_delay=(1, 2))
     assert late.applied(BENCH).shield == plain._replace(frame_age=(0, 2))
@@ -158,7 +150,7 @@ def test_delays_that_cannot_be_are_refused() -> None:
             Batch(bench, PM50, ("f_v",), 1, plant=plant, conditions=conditions)
     Batch(bench, PM50, ("f_v",), 1, plant="late", conditions=with_(command_delay=(0, 1)))
     instruments = Instruments(*range(1, 1 + len(Instruments._fields)))
-    assert delayed(instruments, 2) == instruments._replace(command_delay=3)
+    assert delayed(instruments, 2, 0.0) == instruments._replace(command_delay=3)
 
 
 LAW = make_law(BENCH)
@@ -183,17 +175,16 @@ def test_a_batch_that_hears_what_a_run_heard_sends_what_that_sent(plant: str, tm
     batch = begun(plant, 0)
     batch.experiments.noise[:] = 0.0
     batch.experiments.y[0] = heard[0]
-    store_monitor(begin_monitor(*heard[0].tolist()), batch.experiments.monitor[0])
-    proof = begin_response(batch.setup.response, *heard[0].tolist())
-    store_response(proof, response.OPEN, batch.experiments.response[0])
+    batch.experiments.loops[0] = first_loop(batch.setup, *heard[0].tolist())
     for k in range(HORIZON - 1):
         # The noise that makes the batch's next measurement the run's.
         asked = float(of["policy_current"][active[k]])
         ahead = begun(plant, 0)
-        for mine, other in zip(ahead.experiments, batch.experiments, strict=True):
-            mine[:] = other
+        pairs: Any = zip(ahead.experiments, batch.experiments, strict=True)
+        for mine, other in pairs:
+            mine[0] = other[0]
         ahead.advance(np.array([asked]))
-        batch.experiments.noise[0, k + 1] = heard[k + 1] - ahead.experiments.y[0]
+        batch.experiments.noise[0, k + 1, :2] = heard[k + 1] - ahead.experiments.y[0]
         batch.advance(np.array([asked]))
         assert batch.experiments.past[0, 0] == pytest.approx(of["sent_current"][active[k]], abs=RESOLUTION)
 
@@ -203,7 +194,7 @@ def test_until_the_motion_has_shown_its_sign_a_batch_sends_no_more_than_friction
     weak = np.array([1.5, 1.0, 0.5, 1.0, 1.5, 1.0])
     batch.experiments.brakes[0] *= weak
     for _ in range(15):
-        monitor = monitor_of(batch.experiments.monitor[0])
+        monitor = batch.experiments.loops[0].monitor
         shown.append(monitor.obeys)
         most = largest_current(LAW, batch.setup.thresholds, monitor, 6.0)
         batch.advance(np.array([6.0]))

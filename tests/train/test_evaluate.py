@@ -27,7 +27,7 @@ from emb_train.cli import main
 from emb_train.closed_loop import Batch, Conditions
 from emb_train.evaluate import Settings, Subject, document, evaluate, open_subject, references, text
 from emb_train.optimum import followed, optima, searchable
-from emb_train.play import MEASURES, Draw, Estimating, Law, Played, fresh_draws, mean_score, play
+from emb_train.play import MEASURES, Draw, Excitation, fresh_draws, mean_score, of_actor, of_currents, of_law, play
 from emb_train.training import ONNX, PLAN
 
 from tests.bench.flows import fisher  # isort: skip
@@ -41,8 +41,8 @@ WIDE = BENCH.range_set("pm50")
 PHYSICAL = Conditions(information="physical")
 
 
-def constant(current: float) -> Played:
-    return Played(np.full(BENCH.timing.horizon, current))
+def constant(current: float) -> Excitation:
+    return of_currents(np.full(BENCH.timing.horizon, current))
 
 
 def quiet(line: str) -> None:
@@ -57,7 +57,7 @@ def test_what_was_played_has_the_information_that_plain_python_computes_from_the
     draws = fresh_draws(WIDE, seed=5, count=3)
     excited = parse_excitation("square:period=0.2,amplitude=3", BENCH)
     for name in ("euler", "exact"):
-        outcome = play(BENCH, WIDE, PARAMETER_NAMES, Law(excited.law), draws, name, PHYSICAL)
+        outcome = play(BENCH, WIDE, PARAMETER_NAMES, of_law(excited.law), draws, name, PHYSICAL)
         plant = BENCH.plant(name)
         for i, draw in enumerate(draws):
             rng = np.random.default_rng(draw.seed)
@@ -86,14 +86,16 @@ def test_an_experiment_that_leaves_the_limits_keeps_what_it_had_and_is_not_home(
     batch.begin(0, np.random.default_rng(0), strong.brake)
     before = 0.0
     while not batch.experiments.violated[0]:
-        before = float(batch.experiments.m[0, 0])
+        before = float(batch.newest(batch.experiments.m)[0, 0])
         batch.advance(np.array([6.0]))
     assert (outcome.left[0], outcome.home[0], outcome.matrices[0, 0, 0]) == (True, False, before)
 
 
 def test_policies_that_cannot_be_played_are_refused(tmp_path: Path) -> None:
     with pytest.raises(PolicyRefusedError):
-        play(SHORT, SHORT.range_set("pm50"), ("f_v",), Played([1.0] * 7 + [math.nan] * 60), fresh_draws(WIDE, 0, 1))
+        play(
+            SHORT, SHORT.range_set("pm50"), ("f_v",), of_currents([1.0] * 7 + [math.nan] * 60), fresh_draws(WIDE, 0, 1)
+        )
     path = tmp_path / "empty.onnx"
     path.touch()
     with pytest.raises(PolicyRefusedError, match=str(path)):
@@ -139,7 +141,7 @@ def test_every_reference_asks_for_what_it_asks_for_in_the_runtime() -> None:
         for k in (0, 17, 250, 499):
             seen = rng.uniform([-5.0, -400.0, k, -6.0], [90.0, 400.0, k, 6.0], (3, 4)).astype(np.float32)
             np.testing.assert_allclose(excitation(seen), [excited.law(a, v, int(s)) for a, v, s, _ in seen.tolist()])
-    own = Played(np.array([[1.0, 2.0], [3.0, 4.0]]))  # of each experiment its own
+    own = of_currents(np.array([[1.0, 2.0], [3.0, 4.0]]))  # of each experiment its own
     assert own(np.array([[0, 0, 1, 0], [0, 0, 0, 0]], np.float32)).tolist() == [2.0, 3.0]
 
 
@@ -279,7 +281,7 @@ def test_a_training_for_speeds_is_evaluated_as_the_runtime_plays_its_policy(
     said = json.loads(capsys.readouterr().out)
     row = said["plants"]["euler"]["rows"][0]
     bench = load_bench(finished_speeds / "bench.toml")
-    policy = Estimating(load_policy(finished_speeds / "actor.onnx", bench), bench)
+    policy = of_actor(load_policy(finished_speeds / "actor.onnx", bench), bench)
     draws = fresh_draws(bench.range_set("pm50"), 0, 4)
     outcome = play(bench, bench.range_set("pm50"), PARAMETER_NAMES, policy, draws, "euler", PHYSICAL)
     assert row["values"] == MEASURES["D"].values(outcome.matrices).tolist()

@@ -31,12 +31,10 @@ def test_a_run_with_a_lie_is_ended_where_the_honest_record_shows_it_clearly_and_
     conditions = Conditions(acts="speed", observes="estimate", information="physical")
     env = EmbExcitationVectorEnv(1, BENCH, "pm50", PARAMETER_NAMES, log_determinant, conditions=conditions)
     env.reset(seed=1, options={"brakes": [BENCH.brake]})
-    motion, currents = [env.batch.experiments.x[:, :2].copy()], []
     for speed in speeds:
         env.advance(np.array([[speed]], np.float32))
-        motion.append(env.batch.experiments.x[:, :2].copy())
-        currents.append(env.batch.experiments.applied.copy())
-    found = shown(BENCH, [BENCH.brake], np.stack(motion, axis=1), np.stack(currents, axis=1))[0]
+    e = env.batch.experiments
+    found = shown(BENCH, [BENCH.brake], e.x[:, :, :2], e.applied[:, 1:])[0]
     clear = 0
     for name, share in zip(LIES, found.tolist(), strict=True):
         fault = run(UNEXPLAINED[name], actor=Planned(speeds, BENCH)).outcome.fault

@@ -16,8 +16,9 @@ from emb_bench.estimate.expected import IntervalCriterion
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_train.closed_loop import Conditions
-from emb_train.env import EmbExcitationEnv, EmbExcitationVectorEnv, ExpectedInterval
+from emb_train.env import EmbExcitationEnv, EmbExcitationVectorEnv
 from emb_train.plan import Compared, Found, PlanSearch, play, search, speeds_of
+from emb_train.rewards import ExpectedInterval
 from tests.benches import SENSOR_BENCH
 
 BENCH = SENSOR_BENCH

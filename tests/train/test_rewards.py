@@ -15,7 +15,6 @@ from emb_bench.config.bench import load_bench
 from emb_bench.information.symmetric import pack, unpack
 from emb_runtime.errors import UsageError
 from emb_train.closed_loop import Batch
-from emb_train.env import Scoring
 from emb_train.rewards import (
     ONE_PARAMETER,
     Reward,
@@ -34,6 +33,7 @@ from emb_train.rewards import (
     require_defined,
     squared_determinant_gain,
     trajectory_return,
+    transition,
 )
 from studies.thesis.determinant import normalised
 
@@ -193,33 +193,30 @@ def test_the_rewards_of_one_parameter_refuse_two() -> None:
 
 
 def test_a_reward_gets_the_state_in_which_the_way_home_began(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("emb_train.env.OUTWARD", 20)
-    turns = []
-
-    def noted(t: Transition) -> Any:
-        turns.append(Turn(*(part[0].copy() for part in t.turn)))
-        return t.after[:, 0]
-
+    monkeypatch.setattr("emb_train.rewards.OUTWARD", 20)
     bench = load_bench()
     batch = Batch(bench, bench.range_set("viscous"), ("f_v",), 1)
-    scoring = Scoring(batch, noted)
     batch.begin(0, np.random.default_rng(0))
-    states, informations = [batch.experiments.x[0, :2].copy()], [batch.experiments.m[0].copy()]
+    turns, states, informations = list[Turn](), [batch.x], [batch.newest(batch.experiments.m)]
     for _ in range(30):
-        scoring.advance(np.full(1, 5.0))
-        states.append(batch.experiments.x[0, :2].copy())
-        informations.append(batch.experiments.m[0].copy())
-    assert [turn.x.any() for turn in turns] == [False] * 19 + [True] * 11
+        batch.advance(np.full(1, 5.0))
+        made = transition(batch)
+        np.testing.assert_array_equal(made.before, informations[-1])
+        turns.append(made.turn)
+        states.append(batch.x)
+        informations.append(made.after)
     for turn in turns[19:]:
         np.testing.assert_array_equal(turn.x, states[20])
         np.testing.assert_array_equal(turn.m, informations[20])
-        assert turn.acceleration == pytest.approx((states[20][1] - states[19][1]) / 1e-3)
+        assert turn.acceleration == pytest.approx((states[20] - states[19])[:, 1] / 1e-3)
 
 
 def test_the_packed_matrix_of_the_environment_is_the_one_that_the_rewards_unpack() -> None:
     bench = load_bench()
     batch = Batch(bench, bench.range_set("pm50"), ("k_1", "f_v"), 1)
-    scoring = Scoring(batch, trajectory_return)
     batch.begin(0, np.random.default_rng(0))
-    total = sum(float(scoring.advance(np.full(1, 2.0))[0]) for _ in range(100))
-    assert total == pytest.approx(np.linalg.eigvalsh(unpack(batch.experiments.m[0], 2))[0], rel=1e-9)
+    total = 0.0
+    for _ in range(100):
+        batch.advance(np.full(1, 2.0))
+        total += float(trajectory_return(transition(batch))[0])
+    assert total == pytest.approx(np.linalg.eigvalsh(unpack(batch.experiments.m[0, 100], 2))[0], rel=1e-9)

@@ -164,7 +164,6 @@ def ppo(arguments: argparse.Namespace) -> int:
     Raises:
         EmbError: see :func:`emb_train.training.begin_training` and :func:`emb_train.training.run_training`.
     """
-    from emb_train.closed_loop import EVERYTHING
     from emb_train.network import network_file
     from emb_train.plan import Found
     from emb_train.ppo import Metrics
@@ -182,7 +181,7 @@ def ppo(arguments: argparse.Namespace) -> int:
         arguments.preset, seed=arguments.seed, command_delay=list(arguments.command_delay), **changes
     )
     conditions = training.conditions
-    if conditions.observes == EVERYTHING:
+    if conditions.observes == "everything":
         raise UsageError(
             f"{training.preset}: its actor observes the parameters and the information, which no bench measures: it "
             "could be neither exported nor evaluated; python -m studies.thesis fig-5.2 fig-5.4 trains it and shows it"

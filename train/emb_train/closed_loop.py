@@ -10,12 +10,15 @@ noise, whatever the plant's instruments make of it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
+from numba import typeof
+from numba.typed import List
 from numpy.typing import NDArray
 
 from emb_bench.brake.motion import SENSITIVE, STATES, no_sensitivity
@@ -34,18 +37,12 @@ from emb_runtime.policy.contract import SAMPLE
 from emb_runtime.safety.response import OPEN, PROVEN, ResponseModel, response_model, take, unproven_law
 from emb_runtime.safety.response import State as ResponseState
 from emb_runtime.safety.response import begin as begin_response
-from emb_runtime.safety.sensor_monitor import Cusum, Opposed, judge, largest_current
 from emb_runtime.safety.sensor_monitor import State as MonitorState
 from emb_runtime.safety.sensor_monitor import begin as begin_monitor
+from emb_runtime.safety.sensor_monitor import judge, largest_current
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
 from emb_runtime.safety.shield import PAST, damped_current
 from emb_runtime.safety.shield_design import ShieldLaw, late_step, make_law
-
-MEASURED: Literal["measured"] = "measured"
-ESTIMATE: Literal["estimate"] = "estimate"
-EVERYTHING: Literal["everything"] = "everything"
-CURRENT: Literal["current"] = "current"
-SPEED: Literal["speed"] = "speed"
 
 Bools = NDArray[np.bool_]
 Integers = NDArray[np.int64]
@@ -58,8 +55,6 @@ Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 Gain = Annotated[float, msgspec.Meta(gt=0.0, le=1.0)]
 
 MOST = 100.0  # Greatest estimate or deviation that is observed, of the nominal value
-NUMBERS = 30  # Of a row that stores the state of an estimator or of a sensor monitor
-RESPONSE = 44  # Verdict on the response, and numbers of its proof's state
 
 
 class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -67,9 +62,9 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     shielded: bool = True  # True if the shield is between actor and brake; without it an action is clipped, no more
     horizon: int = 0  # Steps in one experiment; 0 for the bench's
-    acts: Literal["current", "speed"] = CURRENT
+    acts: Literal["current", "speed"] = "current"
     """Action of the actor: a current, or a target speed that the runtime's speed loop follows by the estimate."""
-    observes: Literal["measured", "estimate", "everything"] = MEASURED
+    observes: Literal["measured", "estimate", "everything"] = "measured"
     """Observation of the actor: ``measured`` angle, velocity and step; these and the running ``estimate`` of the four
     parameters with its deviations; or ``everything`` (x₁, x₂, k, θ, the FIM)."""
     systematic: bool = False
@@ -105,13 +100,13 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def observation_size(self, count: int) -> int:
         """Length of the actor's observation if the information of this many parameters is collected."""
-        sizes = {MEASURED: len(SAMPLE), ESTIMATE: len(SAMPLE) + 2 * len(PARAMETER_NAMES)}
+        sizes = {"measured": len(SAMPLE), "estimate": len(SAMPLE) + 2 * len(PARAMETER_NAMES)}
         return sizes.get(self.observes, 3 + count + packed_size(count))
 
     @property
     def estimates(self) -> bool:
         """True if the estimator is in the loop."""
-        return self.acts == SPEED or self.observes == ESTIMATE
+        return self.acts == "speed" or self.observes == "estimate"
 
     def applied(self, bench: Bench) -> Bench:
         """The bench with this horizon, and a shield that covers the drawn delays as well.
@@ -130,24 +125,6 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 BENCH_CONDITIONS = Conditions()
 
 
-class Rules(NamedTuple):
-    """The constants of an experiment; floats and integers only."""
-
-    shielded: bool  # True if the shield has the last word; else the requested current is clipped to the limit
-    sample_time: float  # [s]
-    horizon: int  # Steps in one experiment
-    late_step: int  # Step in which the shield has an experiment that has ended, for it is to go home
-    angle_low: float  # [rad]
-    angle_high: float  # [rad]
-    velocity: float  # Largest speed [rad/s]
-    angle_weight: float  # Of the angle in the FIM, see :func:`emb_bench.information.fisher.weights_of`
-    velocity_weight: float  # Of the velocity
-    damping_velocity: float  # Of the node that brakes by itself [rad/s]; infinite for one that lets go
-    estimates: bool  # True if the estimator is in the loop
-    follows: bool  # True if what is requested is a target speed, which the speed loop follows
-    gain: float  # Of the speed loop
-
-
 class Setup(NamedTuple):
     """Constants that experiments side by side share; it compiles."""
 
@@ -156,156 +133,136 @@ class Setup(NamedTuple):
     response: ResponseModel
     thresholds: SensorThresholds
     """Of the sensor monitor: until the motion has shown its sign, it limits the current to a first move."""
-    rules: Rules
     mechanics: Mechanics  # Mechanics of the brakes
     instruments: Instruments  # Instruments between the brakes and the bus
     chosen: Integers  # Indices in ``PARAMETERS`` of the n parameters whose information is collected, shape [n]
     model: Model  # Of the estimator, the runtime's
+    shielded: bool  # True if the shield has the last word; else the requested current is clipped to the limit
+    angle: tuple[float, float]  # Limits [rad]
+    velocity: float  # Largest speed [rad/s]
+    late_step: int  # Step in which the shield has an experiment that has ended, for it is to go home
+    angle_weight: float  # Of the angle in the FIM, see :func:`emb_bench.information.fisher.weights_of`
+    velocity_weight: float  # Of the velocity
+    damping_velocity: float  # Of the node that brakes by itself [rad/s]; infinite for one that lets go
+    estimates: bool  # True if the estimator is in the loop
+    follows: bool  # True if what is requested is a target speed, which the speed loop follows
+    gain: float  # Of the speed loop
 
 
 def make_setup(bench: Bench, plant: Plant, parameters: Sequence[str], conditions: Conditions) -> Setup:
     """The setup of experiments on a bench, with conditions that are applied, that collect these parameters' FIM."""
-    law, timing, limits = make_law(bench), bench.timing, bench.limits
-    damping = bench.node.damping_velocity if bench.node.stop == "damped" else math.inf
-    rules = Rules(
-        conditions.shielded,
-        timing.sample_time,
-        timing.horizon,
-        late_step(law),
-        *limits.angle,
-        limits.velocity,
-        *weights_of(bench, conditions.information),
-        damping,
-        conditions.estimates,
-        conditions.acts == SPEED,
-        conditions.gain,
+    law, (angle_weight, velocity_weight) = make_law(bench), weights_of(bench, conditions.information)
+    return Setup(
+        law=law,
+        unproven=unproven_law(bench, law),
+        response=response_model(bench, law),
+        thresholds=sensor_thresholds(bench, law),
+        mechanics=plant.mechanics,
+        instruments=plant.instruments,
+        chosen=no_sensitivity(parameters)[0],
+        model=make_model(bench, bench.range_set(bench.prior)),
+        shielded=conditions.shielded,
+        angle=bench.limits.angle,
+        velocity=bench.limits.velocity,
+        late_step=late_step(law),
+        angle_weight=angle_weight,
+        velocity_weight=velocity_weight,
+        damping_velocity=bench.node.damping_velocity if bench.node.stop == "damped" else math.inf,
+        estimates=conditions.estimates,
+        follows=conditions.acts == "speed",
+        gain=conditions.gain,
     )
-    safety = law, unproven_law(bench, law), response_model(bench, law), sensor_thresholds(bench, law)
-    model = make_model(bench, bench.range_set(bench.prior))
-    return Setup(*safety, rules, plant.mechanics, plant.instruments, no_sensitivity(parameters)[0], model)
+
+
+class Loop(NamedTuple):
+    """State of the runtime's loop after a sample."""
+
+    monitor: MonitorState  # Sensor monitor, until it confirms the polarity
+    proof: ResponseState  # Proof of the response, until its verdict
+    verdict: int  # On the response
+    estimate: State  # Of the estimator
 
 
 class Experiments(NamedTuple):
-    """N experiments with n parameters: their brakes, their states, and the errors of all their samples.
+    """N experiments of T steps with n parameters: their brakes, their states, and the errors of all their samples.
 
-    Arrays only, so that it compiles; functions change them in place.
+    Arrays and a list of numba, so that it compiles; functions change them in place. A series has an item for each
+    sample, 0 to T.
     """
 
     brakes: Floats  # Rows of :class:`BrakeParameters`, shape [N, 6]
     delay: Integers  # Samples that each experiment's commands wait beside its plant's delay, shape [N]
-    errors: Floats
-    """Systematic errors: of the angle [rad] and of the current [A], shape [N, 2]."""
+    errors: Floats  # Systematic errors: of the angle [rad] and of the current [A], shape [N, 2]
+    noise: Floats
+    """Series: errors of the measured angle [rad] and velocity [rad/s], and the lateness of the sample [s], shape
+    [N, T + 1, 3]."""
+    k: Integers  # Step, shape [N]
     x: Floats
-    """True states, see :mod:`emb_bench.brake.motion`: angle [rad], velocity [rad/s] and two more, shape [N, 4]."""
+    """Series: true states, see :mod:`emb_bench.brake.motion`: angle [rad], velocity [rad/s] and two more, 0 after the
+    newest; shape [N, T + 1, 4]."""
     s: Floats  # Sensitivities of all four to the relative parameters, shape [N, n, 4]
-    m: Floats  # Packed FIM, shape [N, n (n + 1) / 2]
+    m: Floats  # Series: packed FIM, shape [N, T + 1, n (n + 1) / 2]
+    applied: Floats
+    """Series: the current that acted in the period before the sample, as the node reports it, 0 after the newest [A];
+    shape [N, T + 1]."""
     memory: Floats  # Of the instruments, shape [N, MEMORY]
     y: Floats  # Newest measured angle and velocity, shape [N, 2]
-    applied: Floats  # The current that acted in the period before, as the node last reported it [A], shape [N]
     past: Floats  # The last sent currents, newest first [A], shape [N, PAST]; 0 where nothing was sent
-    k: Integers  # Step, shape [N]
-    noise: Floats  # Of the sensors for all samples of the experiment, shape [N, horizon + 1, 2]
-    late: Floats  # Lateness with which each sample is taken [s], shape [N, horizon + 1]
     reasons: Integers
     """Reasons why the last current is not the requested one: :class:`emb_runtime.records.Reason` bits, shape [N]."""
     violated: Bools  # Mask of the brakes outside their limits, shape [N]
     returning: Bools  # Mask of the experiments that have ended before their horizon and are on the way home, shape [N]
-    monitor: Floats
-    """State of the sensor monitor until it confirms the polarity, see :func:`monitor_of`; shape [N, NUMBERS]."""
-    response: Floats
-    """Verdict on the response, and the state of its proof until then, see :func:`response_of`; shape [N, RESPONSE]."""
-    estimate: Floats  # State of the estimator, see :func:`state_of`; shape [N, NUMBERS]
-    told: Floats
-    """Its values, then their deviations, of k_m, k_1, T_c and f_v in SI units, shape [N, 8]."""
+    loops: list[Loop]  # States of the loop that answers the samples, N
+    told: Floats  # Estimates of k_m, k_1, T_c and f_v in SI units, then their deviations, shape [N, 8]
 
 
-def no_experiments(count: int, n: int, steps: int) -> Experiments:
-    """N experiments with n parameters that are over: each has to begin before its first step."""
+def no_experiments(setup: Setup, count: int, steps: int) -> Experiments:
+    """N experiments of these steps that are over: each has to begin before its first step."""
+    n = len(setup.chosen)
     return Experiments(
         brakes=np.zeros((count, len(BrakeParameters._fields))),
         delay=np.zeros(count, np.int64),
         errors=np.zeros((count, 2)),
-        x=np.zeros((count, STATES)),
+        noise=np.zeros((count, steps + 1, 3)),
+        k=np.full(count, steps),
+        x=np.zeros((count, steps + 1, STATES)),
         s=np.zeros((count, n, SENSITIVE)),
-        m=np.zeros((count, packed_size(n))),
+        m=np.zeros((count, steps + 1, packed_size(n))),
+        applied=np.zeros((count, steps + 1)),
         memory=np.zeros((count, MEMORY)),
         y=np.zeros((count, 2)),
-        applied=np.zeros(count),
         past=np.zeros((count, PAST)),
-        k=np.full(count, steps),
-        noise=np.zeros((count, steps + 1, 2)),
-        late=np.zeros((count, steps + 1)),
         reasons=np.zeros(count, np.int64),
         violated=np.zeros(count, np.bool_),
         returning=np.zeros(count, np.bool_),
-        monitor=np.zeros((count, NUMBERS)),
-        response=np.zeros((count, RESPONSE)),
-        estimate=np.zeros((count, NUMBERS)),
+        loops=compiled(first_loops)(setup, count),
         told=np.zeros((count, 2 * len(PARAMETER_NAMES))),
     )
 
 
-def numbers_of(row: Any) -> Any:
-    """A row as a tuple, shape [NUMBERS]; compiled code makes none of an array."""
-    return six(row, 0) + six(row, 6) + six(row, 12) + six(row, 18) + six(row, 24)
+def first_loops(setup: Setup, count: int) -> Any:
+    """The loops of N experiments whose first measurement is zero."""
+    loops = List()
+    for _ in range(count):
+        loops.append(first_loop(setup, 0.0, 0.0))
+    return loops
 
 
-def six(row: Any, at: int) -> tuple[float, float, float, float, float, float]:
-    """Six numbers of a row, from a place on."""
-    return (
-        float(row[at]), float(row[at + 1]), float(row[at + 2]), float(row[at + 3]), float(row[at + 4]),
-        float(row[at + 5]),
-    )  # fmt: skip
+def first_loop(setup: Setup, angle: float, velocity: float) -> Loop:
+    """The loop at the first measurement [rad, rad/s]."""
+    proof, estimate = begin_response(setup.response, angle, velocity), start(setup.model)
+    if setup.estimates:
+        estimate = follow(setup.model, estimate, angle, velocity, 0.0, 0.0)
+    return Loop(begin_monitor(angle, velocity), proof, OPEN, estimate)
 
 
-def state_of(row: Any) -> State:
-    """The state of an estimator as :func:`store` left it."""
-    f = numbers_of(row)
-    return State(f[0], f[1:7], f[7:28], f[28], f[29])
+def begin_one(setup: Setup, e: Experiments, i: int) -> None:
+    """Take the first sample of experiment ``i``, in place."""
+    e.loops[i] = first_loop(setup, float(e.y[i, 0]), float(e.y[i, 1]))
+    tell(setup.model, e.loops[i].estimate, e.told[i])
 
 
-def store(state: State, row: Any) -> None:
-    """Store the state of an estimator, shape [NUMBERS]."""
-    row[:] = (state.step, *state.mean, *state.covariance, state.innovation, state.worst)
-
-
-def response_of(row: Any) -> ResponseState:
-    """The state of the proof of the response as it is stored behind the verdict, shape [RESPONSE]."""
-    return ResponseState(
-        float(row[1]), float(row[2]), six(row, 3), *six(row, 9), float(row[15]), float(row[16]), six(row, 17),
-        six(row, 23) + six(row, 29) + six(row, 35) + (float(row[41]), float(row[42]), float(row[43])),
-    )  # fmt: skip
-
-
-def store_response(state: ResponseState, verdict: int, row: Any) -> None:
-    """Store the verdict on the response and the state of its proof, shape [RESPONSE]."""
-    sums = (
-        state.flowing, state.largest, state.lagging, state.doubts, state.slides, state.innovations, state.misfit,
-        state.likelihood,
-    )  # fmt: skip
-    row[:] = (float(verdict), state.angle, state.velocity, *state.commands, *sums, *state.mean, *state.covariance)
-
-
-def monitor_of(row: Any) -> MonitorState:
-    """The state of a sensor monitor as :func:`store_monitor` left it."""
-    f = numbers_of(row)
-    travel, motion, opposed = Cusum(f[2], f[3]), Cusum(f[6], f[7]), Opposed(f[8], f[9], f[10], Cusum(f[11], f[12]))
-    shown = f[27] > 0.0, f[28] > 0.0
-    return MonitorState(f[0], f[1], travel, f[4], f[5], motion, opposed, f[13:19], f[19:25], f[25:27], *shown)
-
-
-def store_monitor(state: MonitorState, row: Any) -> None:
-    """Store the state of a sensor monitor, shape [NUMBERS]."""
-    travel, motion, opposed = state.travel, state.motion, state.opposed
-    obeys, confirmed = 1.0 if state.obeys else 0.0, 1.0 if state.confirmed else 0.0
-    row[:] = (
-        state.angle, state.velocity, travel.up, travel.down, state.up_from, state.down_from, motion.up, motion.down,
-        opposed.travel, opposed.integral, opposed.begin, opposed.motion.up, opposed.motion.down,
-        *state.lows, *state.highs, *state.flowing, obeys, confirmed, 0.0,
-    )  # fmt: skip
-
-
-def delayed(instruments: Instruments, delay: int, offset: float = 0.0) -> Instruments:
+def delayed(instruments: Instruments, delay: int, offset: float) -> Instruments:
     """The plant's instruments with later commands [samples] and an offset [rad]; compiled code has no ``_replace``."""
     return Instruments(
         instruments.command_delay + delay,
@@ -318,58 +275,57 @@ def delayed(instruments: Instruments, delay: int, offset: float = 0.0) -> Instru
 
 def advance(setup: Setup, experiments: Experiments, wanted: Floats) -> None:
     """One sample period of all experiments with requested currents [A], or target speeds [rad/s], in place."""
-    rules, model = setup.rules, setup.model
     for i in range(experiments.k.shape[0]):
-        current = float(wanted[i])
-        if rules.follows:
-            state = state_of(experiments.estimate[i])
-            current = current_for(model, state, believed(model, state), current, rules.gain)
-        advance_one(setup, experiments, i, current)
-        if rules.estimates:
-            estimate_one(model, experiments, i)
+        advance_one(setup, experiments, i, float(wanted[i]))
 
 
 def advance_one(setup: Setup, e: Experiments, i: int, wanted: float) -> None:
-    """One sample period of experiment ``i`` with a requested current [A], in place."""
-    rules, x, memory, response, k = setup.rules, e.x[i], e.memory[i], e.response[i], int(e.k[i])
+    """One sample period of experiment ``i`` with a requested current [A], or a target speed [rad/s], in place."""
+    law, limit, model, t_s, k = setup.law, setup.law.current, setup.model, setup.law.sample_time, int(e.k[i])
+    y1, y2, u, b = float(e.y[i, 0]), float(e.y[i, 1]), e.past[i], e.brakes[i]
+    brake = BrakeParameters(float(b[0]), float(b[1]), float(b[2]), float(b[3]), float(b[4]), float(b[5]))
     instruments = delayed(setup.instruments, int(e.delay[i]), float(e.errors[i, 0]))
-    y1, y2, u = float(e.y[i, 0]), float(e.y[i, 1]), e.past[i]
-    seen = monitor_of(e.monitor[i])
-    most = largest_current(setup.law, setup.thresholds, seen, setup.law.current)
-    law = setup.unproven if seen.obeys and response[0] != PROVEN else setup.law
-    step = k
+
+    # The answer to the newest sample: speed loop, sensor monitor, shield
+    monitor, proof, verdict, estimate = e.loops[i]
+    if setup.follows:
+        wanted = current_for(model, estimate, believed(model, estimate), wanted, setup.gain)
+    most = largest_current(law, setup.thresholds, monitor, limit)
+    valid, step = setup.unproven if monitor.obeys and verdict != PROVEN else law, k
     if e.returning[i]:
-        wanted, step = 0.0, max(step, rules.late_step)
+        wanted, step = 0.0, max(step, setup.late_step)
     past = float(u[0]), float(u[1]), float(u[2]), float(u[3]), float(u[4])
-    asked, e.reasons[i] = sent_current(law, rules.shielded, y1, y2, wanted, past, step, most)
-    sent = 0.0 if math.isnan(asked) else asked
+    asked, e.reasons[i] = sent_current(valid, setup.shielded, y1, y2, wanted, past, step, most)
+    obeyed, sent = not math.isnan(asked), 0.0 if math.isnan(asked) else asked
+
+    # The brake and its node until the next sample
+    x, s, m, memory = e.x[i, k + 1], e.s[i], e.m[i, k + 1], e.memory[i]
+    x[:], m[:] = e.x[i, k], e.m[i, k]
     current = command(instruments, memory, asked)
     if math.isnan(current):
-        current = damped_current(float(x[1]), setup.law.current, rules.damping_velocity)
-    errors = float(e.noise[i, k + 1, 0]), float(e.noise[i, k + 1, 1]), float(e.late[i, k + 1])
-    brake, acting = BrakeParameters(*six(e.brakes[i], 0)), current + e.errors[i, 1]
-    states = x, setup.chosen, e.s[i], memory
-    y1, y2 = pass_period(setup.mechanics, instruments, brake, rules.sample_time, acting, errors, *states)
-    add_increment(e.m[i], e.s[i], rules.angle_weight, rules.velocity_weight)
-    e.k[i], e.y[i, 0], e.y[i, 1], e.applied[i] = k + 1, y1, y2, current
+        current = damped_current(float(x[1]), limit, setup.damping_velocity)
+    errors = float(e.noise[i, k + 1, 0]), float(e.noise[i, k + 1, 1]), float(e.noise[i, k + 1, 2])
+    acting, (low, high) = current + e.errors[i, 1], setup.angle
+    y1, y2 = pass_period(setup.mechanics, instruments, brake, t_s, acting, errors, x, setup.chosen, s, memory)
+    add_increment(m, s, setup.angle_weight, setup.velocity_weight)
+    e.violated[i] = not (low <= x[0] <= high and abs(x[1]) <= setup.velocity)
+    e.k[i], e.y[i, 0], e.y[i, 1], e.applied[i, k + 1] = k + 1, y1, y2, current
     u[0], u[1], u[2], u[3], u[4] = sent, past[0], past[1], past[2], past[3]
-    obeyed = not math.isnan(asked)
-    if response[0] == OPEN:
-        proof, verdict = take(setup.response, response_of(response), obeyed, y1, y2, sent)
-        store_response(proof, verdict, response)
-    if not seen.confirmed:
-        seen, _ = judge(setup.law, setup.thresholds, seen, rules.sample_time, y1, y2, obeyed, sent, current)
-        store_monitor(seen, e.monitor[i])
-    inside = rules.angle_low <= x[0] <= rules.angle_high and abs(x[1]) <= rules.velocity
-    e.violated[i] = not inside
+
+    # The new sample: proof of the response, sensor monitor, estimator
+    if verdict == OPEN:
+        proof, verdict = take(setup.response, proof, obeyed, y1, y2, sent)
+    if not monitor.confirmed:
+        monitor, _ = judge(law, setup.thresholds, monitor, t_s, y1, y2, obeyed, sent, current)
+    if setup.estimates:
+        estimate = follow(model, estimate, y1, y2, float(k + 1), current)
+        tell(model, estimate, e.told[i])
+    e.loops[i] = Loop(monitor, proof, verdict, estimate)
 
 
-def estimate_one(model: Model, experiments: Experiments, i: int) -> None:
-    """Take the newest sample of experiment ``i`` into its estimator, in place."""
-    y, row, told = experiments.y[i], experiments.estimate[i], experiments.told[i]
-    state = follow(model, state_of(row), y[0], y[1], float(experiments.k[i]), experiments.applied[i])
-    store(state, row)
-    values, widths = believed(model, state), deviations(model, state)
+def tell(model: Model, estimate: State, told: Floats) -> None:
+    """Write the estimates of the parameters in SI units, and then their deviations, shape [8]."""
+    values, widths = believed(model, estimate), deviations(model, estimate)
     for j in range(4):
         told[j], told[4 + j] = values[j] * model.nominal[j], widths[j] * model.nominal[j]
 
@@ -419,7 +375,7 @@ class Batch:
         require_possible(bench, ranges, self.plant, conditions)
         self.setup = make_setup(bench, self.plant, parameters, conditions)
         self.most = MOST * np.abs(np.array(self.setup.model.nominal * 2))
-        self.experiments = no_experiments(count, len(parameters), self.setup.rules.horizon)
+        self.experiments = no_experiments(self.setup, count, bench.timing.horizon)
         self._columns = [BrakeParameters._fields.index(name) for name in parameters]
         low, high = np.array(ranges.low)[self._columns], np.array(ranges.high)[self._columns]
         self._middle, self._half = 0.5 * (low + high), np.where(high > low, 0.5 * (high - low), 1.0)
@@ -437,28 +393,23 @@ class Batch:
         e = self.experiments
         parameters = drawn(self._ranges, rng, self.conditions.draws)
         e.brakes[i] = parameters if brake is None else brake
-        e.noise[i] = rng.standard_normal(e.noise.shape[1:]) * (self.bench.noise.angle, self.bench.noise.velocity)
-        jitter = self.plant.instruments.clock_jitter
+        noise, jitter = self.bench.noise, self.plant.instruments.clock_jitter
+        e.noise[i, :, :2] = rng.standard_normal((e.noise.shape[1], 2)) * (noise.angle, noise.velocity)
         if jitter > 0.0:
-            e.late[i] = rng.normal(0.0, jitter, e.late.shape[1])
+            e.noise[i, :, 2] = rng.normal(0.0, jitter, e.noise.shape[1])
         if self.conditions.varies:
             low, high = self.conditions.command_delay
             e.delay[i] = rng.integers(low, high + 1)
         if self.conditions.systematic:
             priors = self.bench.systematic
             e.errors[i] = rng.standard_normal(2) * (priors.offset, priors.current_offset)
-        e.x[i] = 0.0
         instruments = delayed(self.plant.instruments, int(e.delay[i]), float(e.errors[i, 0]))
         settle(instruments, e.memory[i], 0.0)
-        errors = (float(error) for error in (e.late[i, 0], *e.noise[i, 0]))
-        e.y[i] = measure(instruments, e.memory[i], self.setup.rules.sample_time, 0.0, 0.0, 0.0, *errors)
-        for of_the_past in (e.applied, e.s, e.m, e.past, e.k, e.reasons, e.violated, e.returning):
+        angle, velocity, late = map(float, e.noise[i, 0])
+        e.y[i] = measure(instruments, e.memory[i], self.bench.timing.sample_time, 0.0, 0.0, 0.0, late, angle, velocity)
+        for of_the_past in (e.k, e.x, e.s, e.m, e.applied, e.past, e.reasons, e.violated, e.returning):
             of_the_past[i] = 0
-        store_monitor(begin_monitor(*e.y[i].tolist()), e.monitor[i])
-        store_response(begin_response(self.setup.response, *e.y[i].tolist()), OPEN, e.response[i])
-        if self.conditions.estimates:
-            store(start(self.setup.model), e.estimate[i])
-            compiled(estimate_one)(self.setup.model, e, i)
+        compiled(begin_one)(self.setup, e, i)
 
     def advance(self, wanted: Floats) -> None:
         """One sample period with the requested currents [A], or target speeds [rad/s], by the conditions; shape [N].
@@ -473,21 +424,41 @@ class Batch:
         if wanted.shape != k.shape:
             acts, count = self.conditions.acts, len(k)
             raise UsageError(f"expected one {acts} for each of the {count} experiments, got shape {wanted.shape}")
-        if (k >= self.setup.rules.horizon).any():
+        if (k >= self.bench.timing.horizon).any():
             raise UsageError("expected experiments that go on, got one that is over or was not begun: call reset first")
-        compiled(advance)(self.setup, self.experiments, wanted)
+        self._step(self.setup, self.experiments, np.ascontiguousarray(wanted, np.float64))
+
+    @cached_property
+    def _step(self) -> Callable[[Setup, Experiments, Floats], None]:
+        """The machine code of a step for these types: to look at lists for their types again takes ten times a step."""
+        step: Any = compiled(advance)
+        if not hasattr(step, "compile"):  # numba is switched off
+            return advance
+        types = map(typeof, (self.setup, self.experiments, np.zeros(len(self.experiments.k))))
+        code: Callable[[Setup, Experiments, Floats], None] = step.compile(tuple(types))
+        return code
+
+    def newest(self, series: Floats) -> Floats:
+        """Items of a series for the newest sample of each experiment, shape [N, ...]; a copy."""
+        newest: Floats = series[np.arange(len(series)), self.experiments.k]
+        return newest
+
+    @property
+    def x(self) -> Floats:
+        """True angle [rad] and velocity [rad/s] at the newest samples, shape [N, 2]."""
+        return self.newest(self.experiments.x[:, :, :2])
 
     @property
     def terminated(self) -> Bools:
         """Mask of the experiments that are over: horizon reached or limits left, shape [N]. Both are true terminals."""
-        return self.experiments.violated | (self.experiments.k >= self.setup.rules.horizon)
+        return self.experiments.violated | (self.experiments.k >= self.bench.timing.horizon)
 
     @property
     def home(self) -> Bools:
         """Mask of the brakes whose angle and velocity are those of home, inside the limits, shape [N]."""
-        e, shield_ = self.experiments, self.bench.shield
-        at_home = (np.abs(e.x[:, 0]) <= shield_.home_angle) & (np.abs(e.x[:, 1]) <= shield_.home_velocity)
-        return at_home & ~e.violated
+        x, shield_ = self.x, self.bench.shield
+        at_home = (np.abs(x[:, 0]) <= shield_.home_angle) & (np.abs(x[:, 1]) <= shield_.home_velocity)
+        return at_home & ~self.experiments.violated
 
     def observation(self) -> NDArray[np.float32]:
         """Observation of the actor, by the conditions: measured, with the estimate, or Table 4.2 without measurements.
@@ -495,10 +466,10 @@ class Batch:
         Returns:
             Shape [N, :meth:`Conditions.observation_size`].
         """
-        if self.conditions.observes == EVERYTHING:
+        if self.conditions.observes == "everything":
             return self.critic_observation()[:, : self.conditions.observation_size(len(self.parameters))].copy()
         measured = self.seen()[:, : len(SAMPLE)]
-        if self.conditions.observes == ESTIMATE:
+        if self.conditions.observes == "estimate":
             return np.hstack([measured, self.estimate()], dtype=np.float32)
         return measured.copy()
 
@@ -509,22 +480,32 @@ class Batch:
 
     def seen(self) -> NDArray[np.float32]:
         """Measured angle [rad] and velocity [rad/s], step, current that acted in the last period [A]; shape [N, 4]."""
-        return np.column_stack((self.experiments.y, self.experiments.k, self.experiments.applied)).astype(np.float32)
+        e = self.experiments
+        return np.column_stack((e.y, e.k, self.newest(e.applied))).astype(np.float32)
 
-    def information(self) -> Floats:
-        """Packed FIMs as the rewards see them, by the conditions, shape [N, n (n + 1) / 2]; a copy."""
+    def information(self, at: Integers) -> Floats:
+        """Packed FIMs at a sample of each experiment as the rewards see them, by the conditions.
+
+        Args:
+            at: number of the sample, shape [N].
+
+        Returns:
+            Shape [N, n (n + 1) / 2].
+        """
+        m: Floats = self.experiments.m[np.arange(len(at)), at]
         if self.conditions.normalised_by == "true":
-            return self.experiments.m.copy()
+            return m
         nominal = np.array([getattr(self.bench.brake, name) for name in self.parameters])
         ratio = nominal / self.experiments.brakes[:, self._columns]
         i, j = upper(len(self.parameters))
-        return self.experiments.m * ratio[:, i] * ratio[:, j]
+        return m * ratio[:, i] * ratio[:, j]
 
     def info(self) -> dict[str, NDArray[Any]]:
         """Outputs of an environment beside the observation, each with N as its first dimension; all of them copies."""
         e = self.experiments
-        kept = {"current": e.past[:, 0], "reasons": e.reasons, "fim": e.m, "violated": e.violated, "home": self.home}
-        return {"critic": self.critic_observation()} | {name: values.copy() for name, values in kept.items()}
+        kept = {"current": e.past[:, 0], "reasons": e.reasons, "violated": e.violated, "home": self.home}
+        own: dict[str, NDArray[Any]] = {"critic": self.critic_observation(), "fim": self.newest(e.m)}
+        return own | {name: values.copy() for name, values in kept.items()}
 
     def critic_observation(self) -> NDArray[np.float32]:
         """Observation of the critic: the true state in fixed scales of order one, shape [N, size].
@@ -533,19 +514,19 @@ class Batch:
         a function of the state, which would not be Markov. Where the delay of the commands is drawn, also that, the
         current in the motor, and the last sent currents, which may still be on their way.
         """
-        e, limits = self.experiments, self.bench.limits
+        e, limits, m = self.experiments, self.bench.limits, self.newest(self.experiments.m)
         outputs = np.array([limits.angle[1], limits.velocity])
         parts = [
-            e.x[:, :2] / outputs,
+            self.x / outputs,
             e.k[:, None] / self.bench.timing.horizon,
             (e.brakes[:, self._columns] - self._middle) / self._half,
-            0.1 * np.copysign(np.log1p(np.abs(e.m)), e.m),
+            0.1 * np.copysign(np.log1p(np.abs(m)), m),
             (4.0 * e.s[:, :, :2] / outputs).reshape(len(e.k), 2 * len(self._columns)),
         ]
         if self.conditions.varies:
             parts += [
                 e.delay[:, None] / self.conditions.command_delay[1],
-                e.x[:, 3:] / limits.current,
+                self.newest(e.x[:, :, 3:]) / limits.current,
                 e.past / limits.current,
             ]
         return np.concatenate(parts, axis=1, dtype=np.float32)

@@ -29,9 +29,7 @@ from emb_runtime.system.input_file import near_file
 from emb_train.closed_loop import Conditions
 from emb_train.optimum import optima, searchable
 from emb_train.play import (
-    Estimating,
     Excitation,
-    Law,
     Measure,
     Outcome,
     Planned,
@@ -39,6 +37,8 @@ from emb_train.play import (
     fresh_draws,
     mean_score,
     middle_of,
+    of_actor,
+    of_law,
     play,
 )
 from emb_train.training import BENCH, ONNX, PLAN, load_plan
@@ -77,7 +77,7 @@ def open_subject(given: str, bench_file: Path | None) -> Subject:
         raise UsageError(f"--bench: {given} is evaluated on the bench that it was trained on; leave it out")
     if path.suffix == ".json":
         plan, bench = load_plan(path), load_bench(own if own.exists() else bench_file)
-        return Subject(given, bench, Estimating(Planned(plan.speeds, bench, plan.gain), bench), plan.ranges)
+        return Subject(given, bench, of_actor(Planned(plan.speeds, bench, plan.gain), bench), plan.ranges)
     if not path.is_dir():
         hint = near(given, [ACTOR]) or near_file(path)
         raise UsageError(f"{given}: expected '{ACTOR}', an .onnx file, the folder of a training or its {PLAN}{hint}")
@@ -98,14 +98,14 @@ def _file(name: str, path: Path, bench: Bench, trained_on: Path | None = None) -
         )
     made_for = {str(name): pair for name, pair in policy.contract.ranges.items()}
     sets = [ranges.name for ranges in bench.ranges.values() if made_for == bounds(ranges)]
-    return Subject(name, bench, Estimating(policy, bench), sets[0] if sets else "")
+    return Subject(name, bench, of_actor(policy, bench), sets[0] if sets else "")
 
 
 def references(bench: Bench) -> dict[str, Excitation]:
     """Every reference excitation by name, constant current of either sign among them."""
     limit = bench.limits.current
     names = [*COMPARED, *(f"step:amplitude={u:g}" for u in (limit, -limit))]
-    return {name: Law(parse_excitation(name, bench).law) for name in names}
+    return {name: of_law(parse_excitation(name, bench).law) for name in names}
 
 
 @dataclass(frozen=True)

@@ -43,49 +43,41 @@ Excitation = Callable[[Seen], Currents]
 """Requested currents [A], shape [N], for observations of N experiments side by side, shape [N, 4]."""
 
 
-class Played:
-    """Currents that are known beforehand, whatever is measured."""
+def of_currents(currents: Sequence[float] | Currents) -> Excitation:
+    """Currents that are known beforehand [A], whatever is measured, shape [T]; of each experiment its own, [N, T]."""
+    known = np.array(currents, np.float64)
 
-    def __init__(self, currents: Sequence[float] | Currents) -> None:
-        """Play these currents [A], one for each step, shape [T]; of each experiment its own, shape [N, T]."""
-        self._currents = np.array(currents, np.float64)
-
-    def __call__(self, seen: Seen) -> Currents:
-        """See :data:`Excitation`."""
+    def excitation(seen: Seen) -> Currents:
         step = seen[:, STEP].astype(np.int64)
-        wanted: Currents = self._currents[(np.arange(len(step)), step) if self._currents.ndim > 1 else step]
+        wanted: Currents = known[(np.arange(len(step)), step) if known.ndim > 1 else step]
         return wanted
 
+    return excitation
 
-class Law:
+
+def of_law(law: reference.Law) -> Excitation:
     """A reference excitation, which answers one measurement at a time."""
-
-    def __init__(self, law: reference.Law) -> None:
-        self._law = law
-
-    def __call__(self, seen: Seen) -> Currents:
-        """See :data:`Excitation`."""
-        return np.array([self._law(angle, velocity, int(step)) for angle, velocity, step, _ in seen.tolist()])
+    return lambda seen: np.array([law(angle, velocity, int(step)) for angle, velocity, step, _ in seen.tolist()])
 
 
-class Estimating:
-    """A policy as the runtime asks it: one sample of one experiment at a time, with an estimator for each."""
+def of_actor(actor: Actor, bench: Bench) -> Excitation:
+    """Currents of an actor as the runtime asks it: one sample of one experiment at a time, with an estimator for each.
 
-    def __init__(self, actor: Actor, bench: Bench) -> None:
-        """Ask an actor for currents [A], with estimates as the bench says."""
-        self._actor, self._bench = actor, bench
-        self._estimators: list[Estimator] = []
+    The estimators are those of the bench, and begin anew in step 0.
+    """
+    estimators: list[Estimator] = []
 
-    def __call__(self, seen: Seen) -> Currents:
-        """See :data:`Excitation`; in step 0 all experiments begin anew."""
+    def excitation(seen: Seen) -> Currents:
         if seen[0, STEP] == 0.0:
-            self._estimators = [Estimator(self._bench) for _ in seen]
+            estimators[:] = [Estimator(bench) for _ in seen]
         wanted: Currents = np.zeros(len(seen))
-        for i, (estimator, row) in enumerate(zip(self._estimators, seen.tolist(), strict=True)):
+        for i, (estimator, row) in enumerate(zip(estimators, seen.tolist(), strict=True)):
             angle, velocity, step, applied = row
             estimator.take(angle, velocity, step, applied)
-            wanted[i] = self._actor.act(angle, velocity, step, estimator)
+            wanted[i] = actor.act(angle, velocity, step, estimator)
         return wanted
+
+    return excitation
 
 
 class Planned:
@@ -149,17 +141,18 @@ def play(
     """
     batch = Batch(bench, ranges, parameters, len(draws), plant, conditions)
     begin_all(batch, draws)
-    e, left = batch.experiments, np.zeros(len(draws), np.bool_)
-    m, currents = e.m.copy(), np.zeros((len(draws), batch.setup.rules.horizon))
-    for k in range(batch.setup.rules.horizon):
+    e, left, kept = batch.experiments, np.zeros(len(draws), np.bool_), np.zeros(len(draws), np.int64)
+    steps = np.arange(batch.bench.timing.horizon)
+    for k in steps:
         wanted = excitation(batch.seen())
         if not np.isfinite(wanted[~left]).all():
             raise PolicyRefusedError(f"its current is not finite at step {k}: it cannot be played")
         batch.advance(wanted)
-        left |= e.violated
-        m = np.where(left[:, None], m, e.m)
-        currents[:, k] = np.where(left, 0.0, e.applied)
-    return Outcome(unpack(m, len(parameters)), left, batch.home & ~left, currents)
+        left |= batch.experiments.violated
+        kept += ~left
+    matrices = unpack(e.m[np.arange(len(draws)), kept], len(parameters))
+    currents = np.where(steps < kept[:, None], e.applied[:, 1:], 0.0)
+    return Outcome(matrices, left, batch.home & ~left, currents)
 
 
 def begin_all(batch: Batch, draws: Sequence[Draw]) -> None:

@@ -480,7 +480,7 @@ def collect(env: EmbExcitationVectorEnv, actor: Actor, noise: Tensor, seeds: Seq
             strayed[t], homes[t] = (torch.from_numpy(over & final[name]) for name in ("violated", "home"))
     states[steps] = torch.from_numpy(info["critic"])
     ended = int(terminals.sum())
-    whole = ended and steps >= env.batch.setup.rules.horizon
+    whole = ended and steps >= env.batch.bench.timing.horizon
     mean_return = float(rewards.sum()) / (ended if whole else env.num_envs + int(terminals[:-1].sum()))
     return Rollout(seen, states, actions, log_densities, rewards, terminals, strayed, homes, mean_return)
 

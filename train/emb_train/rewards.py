@@ -1,22 +1,29 @@
-"""Step rewards: small named functions of what a step did to the brake and to its Fisher information.
+"""Rewards: what a step, or a whole experiment, is worth.
 
-Each takes a :class:`Transition` of N brakes and returns N numbers. Those of the thesis read the weighted FIM (outputs
-divided by 100 rad and 500 rad/s, eq. 4.21). The constants below are those of eq. 5.14 and 5.15; where the thesis prints
-none for another reward, the same ones hold.
+The rewards of a step are small named functions of what it did to the brake and to its Fisher information: each takes a
+:class:`Transition` of N brakes and returns N numbers. Those of the thesis read the weighted FIM (outputs divided by
+100 rad and 500 rad/s, eq. 4.21). The constants below are those of eq. 5.14 and 5.15; where the thesis prints none for
+another reward, the same ones hold. Those of a whole experiment, at the end, look at the experiments of a batch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.information.symmetric import LAMBDA_MIN, LOG_DET, LOG_LAMBDA_MIN, MINUS_LOG_TRACE, each
+from emb_bench.estimate.expected import IntervalCriterion
+from emb_bench.information.symmetric import LAMBDA_MIN, LOG_DET, LOG_LAMBDA_MIN, MINUS_LOG_TRACE, Floats, each
+from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
-
-Floats = NDArray[np.float64]
+from emb_train.closed_loop import Batch, Bools, Positive, Price, Share
+from emb_train.intervals import finite, intervals
+from emb_train.lies import shown
 
 OUTWARD = 300  # Steps before the way home begins (5.3)
 HANDOVER = 450  # Step in which the hybrid's quintic is at the origin and eq. 6.6 takes over
@@ -29,10 +36,12 @@ HYBRID_PAID = 0.1  # Share of the return's information that the hybrid pays; "sc
 EPSILON = 1e-6  # ε of M₀ = ε I (eq. 4.28); the thesis calls it small
 ALPHA = 1e4  # α of eq. 6.4 and 6.5
 PRIOR = 12.0  # Information of a prior of ±50 %: one over the variance of a uniform distribution from 0.5 to 1.5
+UNKNOWN = 1e9  # Times a deviation is too large before the first sample
+SHORTEST = 20  # Samples of a record below which nothing counts as known
 
 
 class Turn(NamedTuple):
-    """State of N brakes in step ``OUTWARD``, where their way home begins; zeros for those that are not there yet."""
+    """State of N brakes in step ``OUTWARD``, where their way home begins; the newest of those not there yet."""
 
     x: Floats  # True angle [rad] and velocity [rad/s], shape [N, 2]
     acceleration: Floats  # Over the period before [rad/s²], shape [N]
@@ -51,6 +60,24 @@ class Transition(NamedTuple):
     horizon: int  # Steps in one experiment, T
     sample_time: float  # [s]
     tracking: float = 1.0  # Factor of the weights of the deviation from the quintic, which the thesis does not print
+
+
+def transition(batch: Batch) -> Transition:
+    """The newest step of a batch of experiments."""
+    e, timing = batch.experiments, batch.bench.timing
+    rows, turn = np.arange(len(e.k)), np.minimum(e.k, OUTWARD)
+    x, slower = e.x[rows, turn, :2], e.x[rows, turn - 1, 1]
+    return Transition(
+        before=batch.information(e.k - 1),
+        after=batch.information(e.k),
+        x=batch.x,
+        step=e.k,
+        violated=batch.experiments.violated,
+        turn=Turn(x, (x[:, 1] - slower) / timing.sample_time, batch.information(turn)),
+        horizon=timing.horizon,
+        sample_time=timing.sample_time,
+        tracking=batch.conditions.tracking,
+    )
 
 
 Reward = Callable[[Transition], Floats]
@@ -184,6 +211,125 @@ def _explored(t: Transition, back: Floats) -> Floats:
     return np.where(t.violated, -UNSAFE_RETURN, np.where(t.step > OUTWARD, back, out))
 
 
+class Demands(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Demands on an experiment besides telling much, and what it pays where it does not meet them.
+
+    A sensor that lies moves a brake by some radians before it is found out: there is to be room on the side of the
+    release. And the motion is to show that a node lies (:mod:`emb_train.lies`).
+    """
+
+    astray: Price = 20.0  # Price of limits left, or of an end away from home [nat]
+    release: Share = 0.3  # Part of the way to the lowest angle that is free
+    beyond: Price = 1.0  # Price of each radian beyond it [nat]
+    shown: Price = 1.15  # How clearly the motion shows each lie; above 1 a run is ended
+    hidden: Price = 10.0  # Price of what a lie is short of that [nat]
+
+
+DEMANDS = Demands()
+
+
+@dataclass(frozen=True)
+class ExpectedInterval:
+    """Reward of a whole experiment, in its last step [nat]: the criterion of the interval that an estimate will have.
+
+    Without a discount it is the sum of the criterion's increments. What the experiment pays is taken off.
+    """
+
+    criterion: IntervalCriterion
+    demands: Demands = DEMANDS
+    pool: Executor | None = None  # Of processes that share the work
+
+    def __call__(self, batch: Batch) -> Floats:
+        """Rewards of the newest step of N experiments, shape [N]: 0 for those that go on."""
+        over, demands, e = batch.terminated, self.demands, batch.experiments
+        rewards = np.zeros(len(over))
+        if not over.any():
+            return rewards
+        brakes, acted, motion = brakes_of(batch, over), e.applied[over, 1:], e.x[over, :, :2]
+        found = intervals(batch.bench, batch.plant.name, batch.parameters, brakes, acted, self.pool)
+        told = shown(batch.bench, brakes, motion, acted)
+        told[batch.experiments.violated[over]] = 0.0  # it was stopped in the middle
+        hidden = np.maximum(demands.shown - told, 0.0)
+        beyond = np.maximum(demands.release * batch.bench.limits.angle[0] - motion[:, :, 0].min(axis=1), 0.0)
+        prices = demands.astray * ~batch.home[over] + demands.beyond * beyond + demands.hidden * hidden.sum(axis=1)
+        rewards[over] = finite([self.criterion.of(one) for one in found]) - prices
+        return rewards
+
+
+class Precision(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Precision to be reached, as relative standard deviations; 95 % of the estimates are within twice that."""
+
+    repeatability: Positive = 0.0065  # Of the running estimates, which ends an experiment
+    interval: Positive = 0.0025  # Between runs, of the whole record
+    price: Price = 10.0  # Of an interval that is e times as wide [periods]
+
+
+PRECISION = Precision()
+
+
+class TimeToPrecision:
+    """Reward of a step: minus the share of the period in which a running estimate was less precise than asked for.
+
+    So the return is minus the number of periods until all four are known. The experiment has ended then, and its way
+    home begins, as in the runtime. What the interval of the whole record is wider than asked for is taken off: when it
+    has ended for the record so far, and what is won on the way is given back at the first sample at home.
+    """
+
+    def __init__(self, precision: Precision = PRECISION, pool: Executor | None = None) -> None:
+        """Reward the experiments of one batch; the ``pool`` has processes that share the work."""
+        self._precision, self._pool = precision, pool
+        self._missing, self._price = np.zeros(1), np.zeros(1)
+
+    def __call__(self, batch: Batch) -> Floats:
+        """Rewards of the newest step of N experiments, shape [N]; the way home begins for those that are known."""
+        returning, begun = batch.experiments.returning, batch.experiments.k == 1
+        before, price = np.where(begun, UNKNOWN, self._missing), np.where(begun, 0.0, self._price)
+        self._missing, self._price = np.minimum(before, self._ratio(batch)), price
+        first, second = np.log(np.maximum(before, 1e-9)), np.log(np.maximum(self._missing, 1e-9))
+        share = np.where(second <= 0.0, first / np.maximum(first - second, 1e-9), 1.0)  # continuous in the time
+        rewards: Floats = np.where(first <= 0.0, 0.0, -np.clip(share, 0.0, 1.0))
+        ended, arrived = ~returning & (self._missing <= 1.0), (price > 0.0) & returning & batch.home
+        returning |= ended
+        for rows, more in ((ended, 1.0), (arrived, 0.0)):
+            if rows.any():
+                now = self._price_of(batch, rows)
+                rewards[rows] += price[rows] - now
+                price[rows] = more * now
+        return rewards
+
+    def _ratio(self, batch: Batch) -> Floats:
+        """Greatest ratio of a relative deviation to the one asked for, shape [N]."""
+        told, asked = batch.estimate(), self._precision.repeatability
+        ratio: Floats = np.minimum((told[:, 4:] / (asked * told[:, :4])).max(axis=1), UNKNOWN)
+        return ratio
+
+    def _price_of(self, batch: Batch, rows: Bools) -> Floats:
+        """Price of the interval of the records so far of R rows, shape [R]."""
+        e, at = batch.experiments, np.flatnonzero(rows)
+        long = e.k[at] >= SHORTEST
+        records = [e.applied[row, 1 : e.k[row] + 1] for row in at[long]]
+        brakes = brakes_of(batch, at[long])
+        found = intervals(batch.bench, batch.plant.name, batch.parameters, brakes, records, self._pool)
+        wide = np.full((len(at), len(batch.parameters)), UNKNOWN)
+        for i, one in zip(np.flatnonzero(long), found, strict=True):
+            wide[i] = np.nan_to_num(one.between_runs[: one.count], nan=UNKNOWN) / self._precision.interval
+        prices: Floats = self._precision.price * np.log(np.clip(wide, 1.0, UNKNOWN)).sum(axis=1)
+        return prices
+
+
+def brakes_of(batch: Batch, rows: NDArray[np.generic]) -> list[BrakeParameters]:
+    """The brakes of some rows of a batch."""
+    return [BrakeParameters(*brake) for brake in batch.experiments.brakes[rows].tolist()]
+
+
+AnyReward = Reward | ExpectedInterval | TimeToPrecision
+
+
+def worth(reward: AnyReward, batch: Batch) -> Floats:
+    """Rewards of the newest step of a batch of experiments, shape [N]."""
+    return reward(batch) if isinstance(reward, ExpectedInterval | TimeToPrecision) else reward(transition(batch))
+
+
 ONE_PARAMETER = (information_increment, penalised_increment, adaptive_return)  # The thesis defines them for one only
 REWARDS: Mapping[str, Reward] = {
     reward.__name__: reward
@@ -202,7 +348,7 @@ REWARDS: Mapping[str, Reward] = {
 """Rewards by the name that a preset gives them."""
 
 
-def require_defined(reward: Reward, parameters: tuple[str, ...]) -> None:
+def require_defined(reward: AnyReward, parameters: Sequence[str]) -> None:
     """Check that a reward is defined for these parameters.
 
     Raises:

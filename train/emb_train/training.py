@@ -35,21 +35,21 @@ from emb_runtime.config.typed import read
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_bytes
 from emb_runtime.system.terminal import DOCUMENT_SCHEMA, json_document
-from emb_train.closed_loop import BENCH_CONDITIONS, ESTIMATE, SPEED, Conditions, Gain, Positive
-from emb_train.env import (
+from emb_train.closed_loop import BENCH_CONDITIONS, Conditions, Gain, Positive
+from emb_train.env import EmbExcitationVectorEnv
+from emb_train.plan import Compared, Found, PlanSearch, search, speeds_of
+from emb_train.ppo import Actor, Metrics, Ppo, at_once, clone, collect, joined, train
+from emb_train.presets import preset_record
+from emb_train.rewards import (
     DEMANDS,
     PRECISION,
+    REWARDS,
     AnyReward,
     Demands,
-    EmbExcitationVectorEnv,
     ExpectedInterval,
     Precision,
     TimeToPrecision,
 )
-from emb_train.plan import Compared, Found, PlanSearch, search, speeds_of
-from emb_train.ppo import Actor, Metrics, Ppo, at_once, clone, collect, joined, train
-from emb_train.presets import preset_record
-from emb_train.rewards import REWARDS
 
 CONFIGURATION, BENCH, METRICS = "training.json", "bench.toml", "metrics.jsonl"
 TIME = "time"  # Reward: until the estimates are precise
@@ -100,21 +100,22 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             UsageError: the reward is not defined for the parameters, or the bench is none for this training.
             BenchFileError: the bench lacks the ranges or a plant.
         """
-        reward: AnyReward
-        if self.reward == TIME:
-            reward = TimeToPrecision(self.precision, pool)
-        elif self.reward in NUMBERS:
-            reward = ExpectedInterval(IntervalCriterion(self.reward), self.demands, pool)
-        else:
-            reward = REWARDS[self.reward]
-        where = (count, bench, self.ranges, self.parameters, reward, self.scale)
-        return [EmbExcitationVectorEnv(*where, plant, self.conditions) for plant in self.plants]
+
+        def reward() -> AnyReward:
+            if self.reward == TIME:
+                return TimeToPrecision(self.precision, pool)
+            if self.reward in NUMBERS:
+                return ExpectedInterval(IntervalCriterion(self.reward), self.demands, pool)
+            return REWARDS[self.reward]
+
+        where = (count, bench, self.ranges, self.parameters)
+        return [EmbExcitationVectorEnv(*where, reward(), self.scale, p, self.conditions) for p in self.plants]
 
     def untrained_actor(self, bench: Bench) -> Actor:
         """The actor that the training begins with."""
         conditions = self.conditions
         inputs = conditions.observation_size(len(self.parameters))
-        return Actor(bench, self.ppo, inputs, speed=conditions.acts == SPEED)
+        return Actor(bench, self.ppo, inputs, speed=conditions.acts == "speed")
 
 
 Show = Callable[[Metrics | Found | None], object]
@@ -140,9 +141,9 @@ def training_from(record: object, source: str) -> Training:
         raise UsageError(f"{source}: reward: expected one of {', '.join(known)}, got '{training.reward}'")
     if training.reward == TIME and not training.conditions.estimates:
         raise UsageError(f'{source}: reward: a time needs the conditions acts = "speed", observes = "estimate"')
-    if (training.conditions.acts == SPEED) != (training.conditions.observes == ESTIMATE):
+    if (training.conditions.acts == "speed") != (training.conditions.observes == "estimate"):
         raise UsageError(f'{source}: conditions: expected acts = "speed" together with observes = "estimate"')
-    if training.plan is not None and training.conditions.acts != SPEED:
+    if training.plan is not None and training.conditions.acts != "speed":
         raise UsageError(f"{source}: plan: expected none, for the actor's action is no speed")
     if training.ppo.noise_hold > training.ppo.rollout:
         raise UsageError(f"{source}: noise_hold: expected at most the rollout of {training.ppo.rollout} steps")
@@ -186,7 +187,7 @@ def hyper_parameters(training: Training) -> dict[str, Any]:
         "demands": training.demands if training.reward in NUMBERS else None,
         "precision": training.precision if training.reward == TIME else None,
     }
-    gain = {"gain": training.conditions.gain} if training.conditions.acts == SPEED else {}
+    gain = {"gain": training.conditions.gain} if training.conditions.acts == "speed" else {}
     in_tables = {
         f"{table}.{name}": value
         for table, record in tables.items()
@@ -303,7 +304,7 @@ class Validation:
 
     def score(self, actor: Actor) -> float:
         """Mean return of an experiment without exploration, in the training's own reward."""
-        steps, count = self._envs[0].batch.setup.rules.horizon, len(self._seeds)
+        steps, count = self._envs[0].batch.bench.timing.horizon, len(self._seeds)
         each = len(self._envs)
         noise = [torch.zeros(steps, count, 1)] * each
         seen = joined(at_once(collect, self._envs, [actor] * each, noise, [self._seeds] * each))
