@@ -42,8 +42,8 @@ class TrainingDivergedError(EmbError):
     exit_code = 1
 
 
-class Ppo(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The hyper-parameters."""
+class Algorithm(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The hyper-parameters of the algorithm as it is published."""
 
     total_steps: Count  # Environment steps of the whole training; rounded up to whole iterations
     envs: Count = 256  # N, experiments that run side by side
@@ -56,6 +56,11 @@ class Ppo(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     clip: Positive = 0.2  # ε of the surrogate objective (eq. 4.48)
     entropy: float = 0.0  # Weight of the entropy bonus
     max_gradient: Positive = 0.5  # Largest norm of the gradient, for each network separately
+
+
+class Ppo(Algorithm, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The hyper-parameters: those of the algorithm, of the networks and of the exploration."""
+
     hidden: tuple[Count, ...] = (64, 64)  # Widths of the hidden layers of both networks
     initial_mean: float = 0.0  # Mean action of the untrained actor, part of the limit
     initial_deviation: Positive = 0.5  # The untrained action's standard deviation, part of the limit
