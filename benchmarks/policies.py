@@ -30,7 +30,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.policy.policy import Inference, Policy, load_policy, shipped_actor_path
 from emb_train.closed_loop import Conditions
 from emb_train.intervals import intervals
-from emb_train.play import Excitation, Planned, fresh_draws, of_actor, of_currents, of_law, play
+from emb_train.play import STEP, Excitation, Planned, fresh_draws, of_actor, of_law, play
 from emb_train.training import load_plan
 
 CLASSICAL = ("square:period=0.36", "constant-speed:turn=0.15", "chirp", "multisine")
@@ -43,7 +43,7 @@ def excitation(name: str, bench: Bench, count: int) -> Excitation:
     if name == RANDOM:
         rng, horizon = np.random.default_rng(0), bench.timing.horizon
         levels = rng.uniform(-bench.limits.current, bench.limits.current, (count, -(-horizon // HELD)))
-        return of_currents(levels.repeat(HELD, axis=1)[:, :horizon])
+        return lambda seen: levels[np.arange(count), seen[:, STEP].astype(int) // HELD]
     if name in CLASSICAL:
         return of_law(parse_excitation(name, bench).law)
     if name.endswith(".json"):

@@ -10,6 +10,7 @@ beside the best single switch between the largest currents that is found there.
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -21,11 +22,14 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 from emb_bench.config.bench import Bench, load_bench
 from emb_train.env import EmbExcitationVectorEnv
-from emb_train.play import APPLIED, Currents, Excitation, Outcome, Seen, grid_draws, of_currents, play
+from emb_train.play import APPLIED, STEP, Currents, Excitation, Outcome, Seen, play
 from emb_train.ppo import DeployedActor, train
 from emb_train.training import Trained, Training, begin_training, load_preset, run_training
+from studies.thesis.trainings import grid_draws
 
 WORTH = 2.737e7  # Mean information on the grid, at least
 RATIO = 1.5  # Steps per second over those of Stable-Baselines3, at least
@@ -136,10 +140,13 @@ def on_grid(trained: Trained, training: Training, bench: Bench) -> dict[str, Out
     def played(excitation: Excitation) -> Outcome:
         return play(bench, ranges, training.parameters, excitation, draws, training.plants[0], training.conditions)
 
+    def switched(u: float, t: int) -> Outcome:
+        return played(lambda seen: np.where(seen[:, STEP] < t, u, -u))
+
     blind = {}
     for u in (limit, -limit):
         for t in range(horizon // 100, horizon + 1, horizon // 100):  # the last is no switch at all
-            blind[f"{u:+g} A, from step {t} {-u:+g} A"] = played(of_currents(np.where(np.arange(horizon) < t, u, -u)))
+            blind[f"{u:+g} A, from step {t} {-u:+g} A"] = switched(u, t)
     best = max(blind, key=lambda name: float(blind[name].matrices.mean()))
     return {"trained actor": played(Network(DeployedActor(trained.actor, limit))), best: blind[best]}
 

@@ -13,10 +13,10 @@ import numpy as np
 
 from emb_bench.information.symmetric import LAMBDA_MIN, LOG_DET, each
 from emb_train.closed_loop import Batch
-from emb_train.play import Draw, fresh_draws, grid_draws
+from emb_train.play import Draw, fresh_draws
 from emb_train.rewards import EPSILON, HOME_ANGLE, HOME_VELOCITY, OUTWARD, RISKY_ANGLE, gain, quintic
 from studies.thesis.facts import Fact
-from studies.thesis.trainings import Floats, Training, Trainings, Trajectories
+from studies.thesis.trainings import Floats, Training, Trainings, Trajectories, grid_draws
 
 Statement = tuple[str, str, bool]  # Printed, found, agrees
 

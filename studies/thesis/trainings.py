@@ -18,9 +18,10 @@ import torch
 from numpy.typing import NDArray
 
 from emb_bench.config.bench import Bench, load_bench
+from emb_runtime.config.bench import Ranges
 from emb_runtime.errors import UsageError
 from emb_train.closed_loop import Batch
-from emb_train.play import Draw, begin_all
+from emb_train.play import Draw, begin_all, middle_of
 from emb_train.ppo import DeployedActor
 from emb_train.rewards import REWARDS, Reward, transition
 from emb_train.training import BENCH, CONFIGURATION, METRICS, begin_training, load_preset, run_training
@@ -94,6 +95,18 @@ class Training:
             over |= batch.experiments.violated
         x, current, rewards, information = map(np.array, series)
         return Trajectories(x, current, rewards, information, over)
+
+
+GRID = 40  # Brakes on the grid (5.2.3)
+
+
+def grid_draws(ranges: Ranges, parameter: str, seed: int) -> list[Draw]:
+    """Brakes with ``parameter`` equally spaced over its range, both ends included; the others at mid-range.
+
+    Brake i has noise from ``seed + i``.
+    """
+    values = np.linspace(getattr(ranges.low, parameter), getattr(ranges.high, parameter), GRID)
+    return [Draw(seed + i, middle_of(ranges)._replace(**{parameter: float(v)})) for i, v in enumerate(values)]
 
 
 class Choice(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

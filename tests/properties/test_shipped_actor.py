@@ -14,10 +14,11 @@ from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train.closed_loop import Conditions
 from emb_train.intervals import intervals
-from emb_train.play import MEASURES, fresh_draws, of_actor, of_currents, play
+from emb_train.play import MEASURES, fresh_draws, of_actor, play
 
 from tests.bench.commission.test_steps import LOGS, found, sheet_text  # isort: skip
 from tests.runtime.operating import EmbRun  # isort: skip
+from tests.train.trainings import constant  # isort: skip
 
 PHYSICAL = Conditions(information="physical")
 
@@ -36,7 +37,7 @@ def test_on_brakes_that_it_never_saw_it_returns_within_limits_with_narrower_inte
     draws = fresh_draws(ranges, 1000, 20)
     actor, push = (
         play(bench, ranges, PARAMETER_NAMES, e, draws, conditions=PHYSICAL)
-        for e in (shipped, of_currents(np.full(bench.timing.horizon, bench.limits.current)))
+        for e in (shipped, constant(bench.limits.current))
     )
     for played in (actor, push):
         assert (int(played.left.sum()), int(played.home.sum())) == (0, len(draws))  # the shield's doing
@@ -79,7 +80,7 @@ def test_it_runs_with_the_bench_file_that_a_commissioning_writes(tmp_path: Path)
     bench = parse_bench(found_text(sheet, found(sheet), LOGS), "found")
     assert (bench.prior, bench.noise == sheet.noise) == (MEASURED, False)
     ranges = bench.range_set(MEASURED)
-    push = of_currents(np.full(bench.timing.horizon, bench.limits.current))
+    push = constant(bench.limits.current)
     for quick in (False, True):
         policy = load_policy(shipped_actor_path(quick), bench)
         assert policy.warnings == ["velocity by sensor, made for one by observer"]

@@ -26,8 +26,9 @@ from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST
 from emb_runtime.safety.shield_design import make_law
 from emb_train.closed_loop import BENCH_CONDITIONS, Batch, Conditions, delayed, first_loop
-from emb_train.play import fresh_draws, of_currents, play
+from emb_train.play import fresh_draws, play
 from tests.benches import SENSOR_BENCH, SENSOR_TEXT
+from tests.train.trainings import constant
 
 BENCH = SENSOR_BENCH
 SHORT = dataclasses.replace(BENCH, timing=dataclasses.replace(BENCH.timing, horizon=60))
@@ -131,8 +132,8 @@ def test_the_critic_sees_what_an_experiment_has_of_its_own() -> None:
 def test_the_shield_covers_the_drawn_delay_and_no_more() -> None:
     conditions = Conditions(command_delay=(0, 2))
     for current in (6.0, -6.0):
-        pushing = of_currents(np.full(500, current))
-        assert not play(BENCH, PM50, PARAMETER_NAMES, pushing, fresh_draws(PM50, 5, 40), "exact", conditions).left.any()
+        pushing, draws = constant(current), fresh_draws(PM50, 5, 40)
+        assert not play(BENCH, PM50, PARAMETER_NAMES, pushing, draws, "exact", conditions).left.any()
     plain, late = Conditions().applied(BENCH).shield, Conditions(command_delay=(1, 2))
     assert late.applied(BENCH).shield == plain._replace(frame_age=(0, 2))
     assert late.applied(late.applied(BENCH)) == late.applied(BENCH)

@@ -27,22 +27,18 @@ from emb_train.cli import main
 from emb_train.closed_loop import Batch, Conditions
 from emb_train.evaluate import Settings, Subject, document, evaluate, open_subject, references, text
 from emb_train.optimum import followed, optima, searchable
-from emb_train.play import MEASURES, Draw, Excitation, fresh_draws, mean_score, of_actor, of_currents, of_law, play
+from emb_train.play import MEASURES, STEP, Draw, fresh_draws, mean_score, of_actor, of_law, play
 from emb_train.training import ONNX, PLAN
 
 from tests.bench.flows import fisher  # isort: skip
 from tests.benches import SENSOR_BENCH
 from tests.commands import refused
-from tests.train.trainings import HORIZON
+from tests.train.trainings import HORIZON, constant
 
 BENCH = load_bench()
 SHORT = parse_bench(shipped_bench_text().replace("horizon     = 500", f"horizon     = {HORIZON}"), "short")
 WIDE = BENCH.range_set("pm50")
 PHYSICAL = Conditions(information="physical")
-
-
-def constant(current: float) -> Excitation:
-    return of_currents(np.full(BENCH.timing.horizon, current))
 
 
 def quiet(line: str) -> None:
@@ -93,9 +89,7 @@ def test_an_experiment_that_leaves_the_limits_keeps_what_it_had_and_is_not_home(
 
 def test_policies_that_cannot_be_played_are_refused(tmp_path: Path) -> None:
     with pytest.raises(PolicyRefusedError):
-        play(
-            SHORT, SHORT.range_set("pm50"), ("f_v",), of_currents([1.0] * 7 + [math.nan] * 60), fresh_draws(WIDE, 0, 1)
-        )
+        play(SHORT, WIDE, ("f_v",), lambda seen: np.where(seen[:, STEP] == 7, np.nan, 1.0), fresh_draws(WIDE, 0, 1))
     path = tmp_path / "empty.onnx"
     path.touch()
     with pytest.raises(PolicyRefusedError, match=str(path)):
@@ -141,8 +135,6 @@ def test_every_reference_asks_for_what_it_asks_for_in_the_runtime() -> None:
         for k in (0, 17, 250, 499):
             seen = rng.uniform([-5.0, -400.0, k, -6.0], [90.0, 400.0, k, 6.0], (3, 4)).astype(np.float32)
             np.testing.assert_allclose(excitation(seen), [excited.law(a, v, int(s)) for a, v, s, _ in seen.tolist()])
-    own = of_currents(np.array([[1.0, 2.0], [3.0, 4.0]]))  # of each experiment its own
-    assert own(np.array([[0, 0, 1, 0], [0, 0, 0, 0]], np.float32)).tolist() == [2.0, 3.0]
 
 
 def test_the_interval_is_that_of_the_currents_that_acted_on_each_brake() -> None:

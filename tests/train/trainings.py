@@ -6,8 +6,10 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from emb_train.play import Excitation
 from emb_train.presets import preset_record
 from emb_train.training import Training, training_from
 from tests.benches import SENSOR_TEXT
@@ -40,6 +42,11 @@ def make_tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let every preset have little to do, in this process."""
     monkeypatch.setattr("emb_train.training.preset_record", tiny_record)
     monkeypatch.setattr("emb_train.training.processes", nullcontext)
+
+
+def constant(current: float) -> Excitation:
+    """The same current [A] at every step."""
+    return lambda seen: np.full(len(seen), current)
 
 
 def short_bench(directory: Path, old: str = "", new: str = "") -> Path:

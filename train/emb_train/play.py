@@ -1,6 +1,6 @@
 """Excitations played on given brakes with given noise, and measures of the information that they collect.
 
-The brakes are drawn, or lie on the fixed grid of the thesis. The shield has the last word over every excitation.
+The shield has the last word over every excitation.
 """
 
 from __future__ import annotations
@@ -41,18 +41,6 @@ Currents = NDArray[np.float64]
 
 Excitation = Callable[[Seen], Currents]
 """Requested currents [A], shape [N], for observations of N experiments side by side, shape [N, 4]."""
-
-
-def of_currents(currents: Sequence[float] | Currents) -> Excitation:
-    """Currents that are known beforehand [A], whatever is measured, shape [T]; of each experiment its own, [N, T]."""
-    known = np.array(currents, np.float64)
-
-    def excitation(seen: Seen) -> Currents:
-        step = seen[:, STEP].astype(np.int64)
-        wanted: Currents = known[(np.arange(len(step)), step) if known.ndim > 1 else step]
-        return wanted
-
-    return excitation
 
 
 def of_law(law: reference.Law) -> Excitation:
@@ -159,18 +147,6 @@ def begin_all(batch: Batch, draws: Sequence[Draw]) -> None:
     """Begin the experiments of a batch, one for each draw."""
     for i, draw in enumerate(draws):
         batch.begin(i, np.random.default_rng(draw.seed), draw.brake)
-
-
-GRID = 40  # Brakes on the grid, as in the thesis (5.2.3)
-
-
-def grid_draws(ranges: Ranges, parameter: str, seed: int) -> list[Draw]:
-    """Brakes with ``parameter`` equally spaced over its range, both ends included; the others at mid-range.
-
-    Brake i has noise from ``seed + i``.
-    """
-    values = np.linspace(getattr(ranges.low, parameter), getattr(ranges.high, parameter), GRID)
-    return [Draw(seed + i, middle_of(ranges)._replace(**{parameter: float(v)})) for i, v in enumerate(values)]
 
 
 def bounds(ranges: Ranges) -> dict[str, tuple[float, float]]:
