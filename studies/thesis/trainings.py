@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from emb_bench.config.bench import Bench, load_bench
 from emb_runtime.config.bench import Ranges
 from emb_runtime.errors import UsageError
+from emb_runtime.system.terminal import json_document
 from emb_train.closed_loop import Batch
 from emb_train.play import Draw, begin_all, middle_of
 from emb_train.ppo import DeployedActor
@@ -230,7 +231,7 @@ def _is_of(folder: Path, config: Configuration) -> bool:
         begun = msgspec.json.decode((folder / CONFIGURATION).read_bytes())
     except (OSError, msgspec.DecodeError):
         return False
-    same: bool = begun == msgspec.json.decode(msgspec.json.encode(config))
+    same: bool = begun == msgspec.json.decode(json_document(msgspec.to_builtins(config)))
     return same
 
 
