@@ -36,7 +36,7 @@ from emb_bench.parallel import processes
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.policy.contract import SAMPLE
 from emb_runtime.policy.policy import Inference, Policy, load_policy, shipped_actor_path
-from emb_train.closed_loop import MEASURED, Conditions, Integers
+from emb_train.closed_loop import Conditions, Integers
 from emb_train.intervals import finite, intervals
 from emb_train.play import (
     MEASURES,
@@ -85,7 +85,7 @@ def thesis_agent(folder: Path, bench: Bench, draws: Sequence[Draw]) -> Excitatio
     """An agent of the thesis: it answers measurements, or its currents are known beforehand if it sees everything."""
     preset, _, seed = folder.name.rpartition("-")
     training = Trainings(folder.parent, bench, (int(seed),), None, print).first(preset)
-    if training.config.conditions.observes == MEASURED:
+    if training.config.conditions.observes == "measured":
         return lambda seen: training.actor(torch.from_numpy(seen[:, : len(SAMPLE)])).detach()[:, 0].double().numpy()
     sent = np.nan_to_num(training.run(draws).current.T)
     return of_currents(np.pad(sent, ((0, 0), (0, bench.timing.horizon - sent.shape[1]))))
