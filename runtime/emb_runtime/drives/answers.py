@@ -12,6 +12,7 @@ from emb_runtime.errors import FrameError
 from emb_runtime.records import CurrentCommand, Frame, NodeState
 
 STATUS_PERIODS = 100  # A status message every so many samples
+OLDEST_CONDITION_NS = 2_000_000_000  # Two conditions that came further apart are no reading together
 ANSWER_PART = 0.75  # Part of a period after a sample within which its answer is obeyed; then the node brakes
 
 
@@ -33,8 +34,8 @@ class Answers:
         self.samples = self.obeyed = self.braked = self.refused = 0
         """Numbers of samples, of commands that were obeyed, of samples without one in time while the host commands, and
         of commands that were not obeyed."""
-        self.conditions = dict[str, float]()
-        """Temperature [degC] and supply voltage [V] by name, the newest since they were last sent."""
+        self.conditions = dict[str, tuple[float, int]]()
+        """Temperature [degC] and supply voltage [V], the newest since they were last sent, and when each came."""
         self._conditions_counter = COUNTER_MODULUS - 1  # the first ones have counter 0
 
     @property
@@ -103,14 +104,15 @@ class Answers:
         if nth == 0:
             number = status % COUNTER_MODULUS
             frames.append(layout.encode_status(number, state, reason, self.refused, self._identity))
-            frames += self._conditions_frames()
+            frames += self._conditions_frames(sample.time_ns)
         return [frame._replace(time_ns=sample.time_ns) for frame in frames]
 
-    def _conditions_frames(self) -> list[Frame]:
-        """The frame of the conditions, once both have come, and if their signals carry them."""
+    def _conditions_frames(self, now_ns: int) -> list[Frame]:
+        """The frame of the conditions, once both have come of late, and if their signals carry them."""
         message = self._layout.optional["EMB_Conditions"]
         signals = message.signal("Temperature"), message.signal("SupplyVoltage")
-        temperature, voltage = (self.conditions.get(name, math.nan) for name in ("temperature", "supply_voltage"))
+        late = {name: value for name, (value, at) in self.conditions.items() if now_ns - at <= OLDEST_CONDITION_NS}
+        temperature, voltage = (late.get(name, math.nan) for name in ("temperature", "supply_voltage"))
         if not all(s.minimum <= v <= s.maximum for s, v in zip(signals, (temperature, voltage), strict=True)):
             return []  # this way round, NaN is none
         self.conditions.clear()

@@ -148,7 +148,7 @@ class Mapping:
     velocity: Measured
     sensors: Sensors  # Origin of the velocity; a sensor where the file says nothing of it
     current: Measured | None
-    conditions: Dictionary[str, Measured]  # Temperature [degC] and supply voltage [V], by name: for the log alone
+    conditions: Dictionary[str, Measured]  # Temperature [degC] and supply voltage [V], by name: nothing acts on them
     command: Commanded
     state: State | None
     arm: tuple[Step, ...]

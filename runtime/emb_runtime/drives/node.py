@@ -151,7 +151,7 @@ class DriveNode:
         Behind a status come the conditions, where the mapping names both and they have come since the last ones.
         """
         receiver, before_ns = self.receiver, self.receiver.state_ns
-        self.answers.conditions |= conditions_in(self._mapping, frame)
+        self.answers.conditions |= {name: (one, now_ns) for name, one in conditions_in(self._mapping, frame).items()}
         sample = receiver.take(frame)
         if isinstance(self.phase, Arming) and receiver.state_ns != before_ns:
             self.arming.on_report(receiver.state(now_ns), receiver.state_ns)

@@ -389,6 +389,13 @@ def test_conditions_go_to_the_host_with_a_status_once_both_have_come(
     assert [row["Counter"] for row in shown] == [*range(len(told))]
 
 
+def test_conditions_that_came_long_apart_are_no_reading_together(played: Played) -> None:
+    for identifier, data in ((0x015, struct.pack("<ff", 0.0, 61.5)), (0x017, struct.pack("<ff", 12.5, 0.0))):
+        played.drive.waiting.append(Frame(identifier, data))
+        sent = [f for _ in range(2200) for f in played.period()]
+        assert not [f for f in sent if f.identifier == LAYOUT.optional["EMB_Conditions"].identifier]
+
+
 def test_listening_sends_nothing(played: Played) -> None:
     assert run(played, 1500, arms=False) == ["ready"]
     assert played.drive.sent == []
