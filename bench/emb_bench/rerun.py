@@ -178,6 +178,14 @@ class DivergedError(Exception):
     """The core has left the log: nothing after this can be compared."""
 
 
+class Sent(NamedTuple):
+    """A frame that the core has sent."""
+
+    step: int | None
+    frame: Frame
+    was_there: bool  # On the bus, by the record of the call; else it may have been
+
+
 class Playback:
     """Inputs of a log for a core, and a comparison of what the core records with what the log has."""
 
@@ -188,7 +196,8 @@ class Playback:
         self.differences: list[Difference] = []  # In the order in which they came
         self._estimates = by_step(log)
         self._due, self._came = tuple[str, ...](), ""  # inputs of which one comes next, and what the core has done
-        self._sent = deque[tuple[int | None, Frame, bool]]()  # not found on the bus yet: step, frame, it was there
+        self._sent = deque[Sent]()  # not found on the bus yet
+        self._stop_frame: Sent | None = None  # of the last such call; None where the guard let none pass
         self._step: int | None = None
 
     def send(self, frame: Frame) -> None:
@@ -197,7 +206,11 @@ class Playback:
         assert isinstance(call, InputRecord)
         if call.text:
             raise TransmitQueueFullError(call.text)
-        self._sent.append((self._step, frame, call.send_time_ns > 0 or call.call == Call.STOP_FRAME))
+        is_stop = call.call == Call.STOP_FRAME
+        sent = Sent(self._step, frame, call.send_time_ns > 0 or is_stop)
+        self._sent.append(sent)
+        if is_stop:
+            self._stop_frame = sent
 
     def play(self, core: Core) -> None:
         """Play all that was recorded, or until the core leaves it."""
@@ -263,9 +276,11 @@ class Playback:
                 core.explain(Fault[code], time_ns, text)
             case Call.NOTE:
                 core.note(time_ns, code, text)
-                if code == STOP_FRAME_NOT_SENT and self._sent:
-                    self._sent.append((*self._sent.pop()[:2], False))
+                # The guard may have let none pass: then the last that waits is another one.
+                if code == STOP_FRAME_NOT_SENT and self._sent and self._sent[-1] is self._stop_frame:
+                    self._sent.append(self._sent.pop()._replace(was_there=False))
             case Call.STOP_FRAME:
+                self._stop_frame = None
                 with contextlib.suppress(GuardRejectedError):
                     core.guard.send(core.stop_frame(time_ns))
             case _:
@@ -308,14 +323,19 @@ class Playback:
             self._check(step, name + of, recorded, value)
 
     def _find_sent(self, echo: Frame | None) -> None:
-        """Find the sent frame whose echo was recorded, None at the end: those before it were not on the bus."""
+        """Find the sent frame whose echo was recorded, None at the end: those before it were not on the bus.
+
+        An echo of no frame that waits is compared with the first that was on the bus.
+        """
         bare = echo and echo._replace(time_ns=0, own=False, dropped=0)
+        is_other = echo is not None and all(sent.frame != bare for sent in self._sent)
         while self._sent:
-            step, frame, is_sent = self._sent.popleft()
-            if frame == bare:
+            step, frame, was_there = self._sent.popleft()
+            if frame == bare or (is_other and was_there):
                 self.counts[FrameRecord] += 1
+                self._check(step, "sent frame", _hex(bare), _hex(frame))
                 return
-            if is_sent:
+            if was_there:
                 self._check(step, "sent frame", _hex(None), _hex(frame))
         self._check(self._step, "sent frame", _hex(bare), _hex(None))
 

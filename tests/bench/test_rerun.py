@@ -18,6 +18,7 @@ from emb_bench.sim.transport import SimTransport
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import Bench, parse_bench
+from emb_runtime.control.loop import STOP_FRAME_NOT_SENT
 from emb_runtime.log.ring_buffer import EventRecord, FrameRecord, InputRecord, Record, pack, unpack
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.records import Call, CycleRecord, Frame, Reason, RunState
@@ -350,7 +351,22 @@ def test_a_sent_frame_that_is_missing_or_other_is_reported(recorded: Callable[..
     for number in (0, 70, -4, -3, -2, -1):
         for alter, recorded_as in ((remove, "no such frame"), (change, "080#"), (add, "080#")):
             result = again(run, alter=partial(alter, number))
-            assert any(d.what == "sent frame" and d.recorded.startswith(recorded_as) for d in result.differences)
+            (found,) = (d for d in result.differences if d.what == "sent frame")
+            assert found.recorded.startswith(recorded_as)
+            assert found.came == "no such frame" if alter is add else found.came.startswith("080#")
+
+
+def test_a_stop_frame_that_the_guard_refused_excuses_no_other_frame(
+    recorded: Callable[..., Driven], again: Again
+) -> None:
+    def refused(records: list[Record]) -> None:
+        del records[own(records, -1)]
+        now = records[-1].time_ns  # of the end, after which nothing may leave
+        note = InputRecord(now, Call.NOTE, 0, STOP_FRAME_NOT_SENT, "the guard refused it")
+        records += [InputRecord(now, Call.STOP_FRAME), note, EventRecord(now, note.code, note.text)]
+
+    (found,) = again(recorded(), alter=refused, outcome=None).differences
+    assert (found.what, found.recorded) == ("sent frame", "no such frame")
 
 
 def test_a_missing_event_or_another_one_is_reported(recorded: Callable[..., Driven], again: Again) -> None:
