@@ -380,11 +380,11 @@ def verdict(study: Study, accepted: Result | None = None) -> Verdict:
     """The most severe verdict that holds; ``accepted`` is the result of acceptance criteria, if there are any.
 
     A brake outside of the shield's ranges is never good, nor is a simulated one, or a log that lacks something. Of runs
-    side by side it is the worse one.
+    side by side it is the worst one.
     """
     if study.side_by_side:
         found = [verdict(own, accepted) for own in study.side_by_side]
-        return min(found, key=lambda one: list(Code).index(one.code))
+        return min(found, key=lambda one: (list(Code).index(one.code), ("bad", "care", "good").index(one.tone)))
     model, tone = next((code, tone) for code, tone, held in MODEL_VERDICTS if held(study, accepted))
     code, tone = next(((code, tone) for code, tone, held in VERDICTS if held(study, accepted)), (model, tone))
     if study.outside:

@@ -100,6 +100,18 @@ def test_acceptance_counts_before_the_model_and_a_stop_before_both(study: Study)
         assert verdict(with_log(study, metadata=STOP), result).code is Code.STOPPED
 
 
+def test_of_runs_side_by_side_the_worst_counts_whatever_their_order(study: Study) -> None:
+    outside, worse = with_first(study, outside=(0.0, 1.0)), misfit(study)
+    rows: list[tuple[Study, Study, Code, Tone]] = [
+        (study, outside, Code.FITS, "bad"),
+        (outside, worse, Code.DOES_NOT_FIT, "bad"),
+    ]
+    for one, other, code, tone in rows:
+        for order in ((one, other), (other, one)):
+            runs = tuple(replace(own.runs[0], alone=own) for own in order)
+            assert verdict(replace(study, runs=runs, joint=None))[:2] == (code, tone)
+
+
 def test_nothing_is_good_without_an_estimate_or_of_a_simulated_brake(study: Study) -> None:
     none = replace(with_run(study, why_not="no experiment"), joint=None, conclusions=())
     assert verdict(none) == (Code.NO_ESTIMATE, "care", Code.NO_ESTIMATE)
