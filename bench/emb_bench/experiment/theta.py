@@ -24,21 +24,21 @@ def read_theta(
 
     They are values by name, ``name=value,name=value``, ``log`` for the last running estimate in the log, nothing for
     that or nominal where there is none, ``nominal``, ``true``, or the JSON of an estimate or a report; the others are
-    nominal. Planned currents have no log.
+    nominal. Planned currents have no log, and neither ``log`` nor ``true``.
     """
     if isinstance(given, Mapping):
         named = ",".join(f"{name}={value}" for name, value in given.items()) or "nominal"
         return named, true_parameters(bench, given, option="--theta: "), NO_ERRORS
     choice = "" if given is None else str(given)
-    if choice in ("", LOG):
-        if log is not None and (values := _running(log, bench)):
+    if log is not None and choice in ("", LOG):
+        if values := _running(log, bench):
             return LOG, bench.brake._replace(**values), NO_ERRORS
         if choice:
             raise UsageError("--theta log: expected a running estimate in the log, and there is none")
     if choice in ("", "nominal"):
         return "nominal", bench.brake, NO_ERRORS
-    if choice == "true":
-        if log is None or log.truth is None:
+    if log is not None and choice == "true":
+        if log.truth is None:
             raise UsageError("--theta true: this log does not know the brake's true parameters, only a simulated one's")
         for name, value in log.truth._asdict().items():
             check_near_nominal(bench, name, value, "--theta true: ")
@@ -86,8 +86,8 @@ def _from_file(path: str, log: RunLog | None, bench: Bench) -> tuple[dict[str, f
     try:
         found = read_document(path, _Estimate, path)
     except OSError as err:
-        hint = near(path, ("log", "nominal", "true"))
-        expected = f"expected log, nominal, true, name=value or a file{hint}"
+        known = ("nominal",) if log is None else (LOG, "nominal", "true")
+        expected = f"expected {', '.join(known)}, name=value or a file{near(path, known)}"
         raise UsageError(f"--theta: {expected}; {path}: {err.strerror}") from err
     names = PARAMETER_NAMES if bench.machine is None else (*PARAMETER_NAMES, "J")
     shown = {name: quantity(bench.machine, name).name for name in names}
