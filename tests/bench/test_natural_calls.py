@@ -361,6 +361,11 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], type[Exception], str]] = {
         UsageError,
         "campaign has no option 'map'",
     ),
+    "campaign(path, 'rows.csv', bench_of_all=)": (
+        lambda s: api.campaign(s.path, s.folder / "rows.csv", bench_of_all=None),
+        UsageError,
+        "campaign has no option 'bench_of_all'",
+    ),
     "campaign(path, 'rows.csv', jobs=0)": (
         lambda s: api.campaign(s.path, s.folder / "rows.csv", jobs=0),
         UsageError,

@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
-from dataclasses import replace
 from functools import partial
 from pathlib import Path, PurePath
 
@@ -33,11 +32,10 @@ PASSED_OVER = (HOMING_LOG + SUFFIX, LISTEN_ONLY_LOG + SUFFIX)  # Logs of emb-run
 
 def run_campaign(paths: Sequence[Path], output: Path, options: CampaignOptions) -> Campaign:
     """Evaluate logs, and write their rows; the arguments are those of :func:`emb_bench.api.campaign`."""
-    if options.bench is not None:
-        its = load_bench(options.bench, analysis=True)
-        its.plant(options.model or DEFAULT_PLANT)
-        options.question(its)
-        options = replace(options, bench_of_all=its)
+    bench = None if options.bench is None else load_bench(options.bench, analysis=True)
+    if bench is not None:
+        bench.plant(options.model or DEFAULT_PLANT)
+        options.question(bench)
     require_place("--output", output, ROWS)
     chart = None if options.chart is None else Path(options.chart)
     require_place("--chart", chart, PICTURES)
@@ -45,7 +43,7 @@ def run_campaign(paths: Sequence[Path], output: Path, options: CampaignOptions) 
         import numba  # noqa: F401
         import pyarrow  # noqa: F401
         import scipy  # noqa: F401
-    sources, evaluate = find(paths), partial(evaluate_one, options=options)
+    sources, evaluate = find(paths), partial(evaluate_one, options=options, bench=bench)
     limit = options.time_limit
     with replacing(output) as beside:
         if options.ray is None:
@@ -53,8 +51,8 @@ def run_campaign(paths: Sequence[Path], output: Path, options: CampaignOptions) 
         else:
             numbered = shared_out_on_ray(evaluate, sources, options.jobs, limit, options.ray)
         rows = mark_copies(in_order(sources, numbered))
-        write_rows(beside, output.suffix.lower(), rows, options)
-    found = summarise(rows, options, str(output))
+        write_rows(beside, output.suffix.lower(), rows, options, bench)
+    found = summarise(rows, options, str(output), bench)
     if chart is not None and not draw_chart(rows, found, chart):
         mention(f"{chart}: not drawn: no run that the model fits identifies a parameter")
     return found

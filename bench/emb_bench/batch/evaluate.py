@@ -33,11 +33,15 @@ from emb_runtime.system.terminal import escaped
 FIRST = 50  # Samples whose noise distinguishes a run from any other
 
 
-def evaluate_one(source: Source, options: CampaignOptions) -> Row:
-    """Evaluate one log. Whatever is wrong with it becomes the row's ``error``; what was found before that stays."""
+def evaluate_one(source: Source, options: CampaignOptions, bench: Bench | None = None) -> Row:
+    """Evaluate one log with a bench, or else with its own.
+
+    Whatever is wrong with it becomes the row's ``error``; what was found before that stays. The bench is its content:
+    another machine does not have the file.
+    """
     row = failed(source, "")
     try:
-        for found in _steps(source, options):
+        for found in _steps(source, options, bench):
             row |= found
     except EmbError as err:
         return row | {"error": failed(source, str(err))["error"]}
@@ -46,7 +50,7 @@ def evaluate_one(source: Source, options: CampaignOptions) -> Row:
     return row | {"error": None}
 
 
-def _steps(source: Source, options: CampaignOptions) -> Iterator[Row]:
+def _steps(source: Source, options: CampaignOptions, given: Bench | None) -> Iterator[Row]:
     """Fields of the row, as far as one gets."""
     if source.trouble:
         raise UsageError(f"{source.path}: {source.trouble}")
@@ -55,7 +59,7 @@ def _steps(source: Source, options: CampaignOptions) -> Iterator[Row]:
     log = read_log(source.path)
     yield _of_the_run(log)
     require_driven(log)
-    bench = options.bench_of_all or log.bench
+    bench = given or log.bench
     check_sample_time(log, bench)
     plant = bench.model(options.model or default_model(log)[0])
     question = options.question(bench)

@@ -54,7 +54,6 @@ class CampaignOptions(SearchOptions):
         "FILE",
         kind=Path,
     )
-    bench_of_all: Bench | None = None  # Content of the bench file, which other machines do not have
 
     def __post_init__(self) -> None:
         """Check all that needs no bench."""
@@ -64,18 +63,16 @@ class CampaignOptions(SearchOptions):
         if not 1e-3 <= self.time_limit <= 1e6:
             raise UsageError(f"--time-limit: expected 0.001 to 1e6 s, got {self.time_limit:g}")
 
-    @property
-    def names(self) -> tuple[str, ...]:
+    def unknowns_on(self, bench: Bench | None) -> tuple[str, ...]:
         """All unknowns, nuisances last."""
-        params, nuisances = self.names_on(self.bench_of_all)
+        params, nuisances = self.names_on(bench)
         return (*params, *nuisances)
 
-    @property
-    def origin(self) -> dict[str, Any]:
+    def origin_on(self, bench: Bench | None) -> dict[str, Any]:
         """Options that the rows depend on, for the file that has them."""
-        params, nuisances = self.names_on(self.bench_of_all)
+        params, nuisances = self.names_on(bench)
         kept = {name: getattr(self, name) for name in ("model", "prior", "starts", "seed")}
-        text = None if self.bench_of_all is None else self.bench_of_all.text
+        text = None if bench is None else bench.text
         return {"method": self.method, "params": params, "nuisances": nuisances, "bench_text": text, **kept}
 
 
@@ -180,8 +177,10 @@ def failed(source: Source, why: str) -> Row:
     return {**places, "error": escaped(" ".join(why.split()))}
 
 
-def write_rows(path: Path, ending: str, rows: Sequence[Row], options: CampaignOptions) -> None:
-    """Writes a Parquet or CSV file: one row for each log.
+def write_rows(
+    path: Path, ending: str, rows: Sequence[Row], options: CampaignOptions, bench: Bench | None = None
+) -> None:
+    """Writes a Parquet or CSV file: one row for each log, evaluated with the bench, or else with its own.
 
     Parquet has units in the columns' metadata and the options in the file's. CSV has neither, and the entries of a list
     with ``"; "`` between them. The same rows give the same bytes.
@@ -199,13 +198,13 @@ def write_rows(path: Path, ending: str, rows: Sequence[Row], options: CampaignOp
     }
     about = {
         "tool": f"emb-excite {metadata.version('emb-excite')}",
-        "options": json.dumps(options.origin),
+        "options": json.dumps(options.origin_on(bench)),
         "logs": str(len(rows)),
         "failed": str(sum(row["error"] is not None for row in rows)),
     }
     described = [
         pa.field(name, kinds[one.kind], metadata={k: v for k, v in (("about", one.about), ("unit", one.unit)) if v})
-        for name, one in columns(options.names).items()
+        for name, one in columns(options.unknowns_on(bench)).items()
     ]
     table = pa.Table.from_pylist(list(rows), pa.schema(described, metadata=about))
     if ending == ".parquet":

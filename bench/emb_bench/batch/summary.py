@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from emb_bench.analysis.several_runs import Constancy, Slope, beyond, constancy, slope
 from emb_bench.batch.row import NONE, CampaignOptions, Row, unit_of
 from emb_bench.brake.parameters import PARAMETERS
+from emb_bench.config.bench import Bench
 from emb_bench.config.conditions import CONDITIONS
 from emb_bench.documents import to_json
 from emb_bench.estimate.records import DONE
@@ -74,7 +75,7 @@ class Campaign:
     parameters: dict[str, ParameterSummary]
 
 
-def summarise(rows: Sequence[Row], options: CampaignOptions, result: str) -> Campaign:
+def summarise(rows: Sequence[Row], options: CampaignOptions, result: str, bench: Bench | None = None) -> Campaign:
     """Summary of a campaign; numbers may be infinite."""
     good = [row for row in rows if row["error"] is None]
     counted = counting(rows)
@@ -94,7 +95,7 @@ def summarise(rows: Sequence[Row], options: CampaignOptions, result: str) -> Cam
         method=options.method,
         models=tuple(sorted({row["model"] for row in good if row.get("model") is not None})),
         span=(max(starts) - min(starts)) / HOUR if starts else 0.0,
-        parameters={name: _parameter(counted, name) for name in options.names},
+        parameters={name: _parameter(counted, name) for name in options.unknowns_on(bench)},
     )
 
 

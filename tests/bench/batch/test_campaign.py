@@ -250,7 +250,7 @@ def test_a_campaign_of_broken_logs_writes_why_and_exits_with_6(
 def test_a_log_of_another_sample_time_than_the_bench_fails_with_what_is_known_of_it(folder: Path, bench: Bench) -> None:
     other = parse_bench(bench.text.replace("sample_time = 1.0e-3", "sample_time = 2.0e-3"), "other", analysis=True)
     path = folder / "monday/a.mcap"
-    row = evaluate_one(Source(str(path), str(folder), "monday/a.mcap", "monday"), CampaignOptions(bench_of_all=other))
+    row = evaluate_one(Source(str(path), str(folder), "monday/a.mcap", "monday"), CampaignOptions(), other)
     assert row["error"] == f"{path}: expected a sample time of 0.002 s, as in the bench file, got 0.001 s"
     assert row["exit_reason"] == "DONE"
     assert "log_det" not in row
@@ -283,6 +283,6 @@ def test_samples_beyond_a_limit_are_counted(folder: Path, bench: Bench) -> None:
     speeds = np.sort(np.abs(experiment.all_samples[:, 1]))
     limit = f"{0.5 * (speeds[-8] + speeds[-7]):.6f}"
     narrow = re.sub(r"(?m)^velocity = [0-9.e]+( .*rad/s.*)$", f"velocity = {limit}", bench.text, count=1)
-    options = CampaignOptions(method="none", bench_of_all=parse_bench(narrow, "narrow", analysis=True))
-    row = evaluate_one(Source(str(path), "", "a.mcap", "."), options)
+    its = parse_bench(narrow, "narrow", analysis=True)
+    row = evaluate_one(Source(str(path), "", "a.mcap", "."), CampaignOptions(method="none"), its)
     assert (row["error"], row["violations"]) == (None, 7)
