@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from emb_bench.api.arguments import options_of
 from emb_bench.batch.row import CampaignOptions
+from emb_runtime.errors import needs
 
 if TYPE_CHECKING:
     from emb_bench.batch.summary import Campaign
@@ -34,7 +35,7 @@ def campaign(
     Raises:
         UsageError: an argument is wrong, there is no log, a library is missing, or a file cannot be written.
     """
-    from emb_bench.batch.campaign import run_campaign
-
+    with needs("a campaign", "bench"):
+        from emb_bench.batch.campaign import run_campaign
     places = [Path(path) for path in ([paths] if isinstance(paths, str | Path) else paths)]
     return run_campaign(places, Path(output), options_of("campaign", CampaignOptions, options, more))

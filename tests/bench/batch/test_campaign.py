@@ -8,6 +8,8 @@ import json
 import math
 import os
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -286,3 +288,18 @@ def test_samples_beyond_a_limit_are_counted(folder: Path, bench: Bench) -> None:
     its = parse_bench(narrow, "narrow", analysis=True)
     row = evaluate_one(Source(str(path), "", "a.mcap", "."), CampaignOptions(method="none"), its)
     assert (row["error"], row["violations"]) == (None, 7)
+
+
+@pytest.mark.parametrize("missing", ["scipy", "numba", "pyarrow"])
+def test_a_missing_extra_is_named_in_one_line(folder: Path, tmp_path: Path, missing: str) -> None:
+    code = (
+        "import sys\n"
+        f"sys.modules[{missing!r}] = None\n"
+        "from emb_bench.cli.replay import main\n"
+        f"sys.exit(main(['campaign', {str(folder / 'monday')!r}, '-o', {str(tmp_path / 'r.csv')!r}]))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
+    assert result.returncode == 2
+    (said,) = result.stderr.splitlines()
+    assert said.startswith(f"emb-replay: a campaign needs {missing}: ")
+    assert "'.[bench]'" in said
