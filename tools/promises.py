@@ -2,7 +2,8 @@
 
 docs/reference/promises.md has a table for each page: a sentence of it, word for word, and its tests or searches. A
 promise is every sentence of SECTIONS, and every sentence of PAGES with one of WORDS. Found are promises without a row,
-rows whose sentence is not on its page, and rows without a test that pytest collects or a search of ``make night``.
+rows whose sentence is not on its page, and rows without a test of that name in its file or a search of ``make night``.
+Whether the test would fail is not checked, nor what runs it: slow ones ``make night``, those of tests/hil ``make hil``.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.docs_pages import plain_references
+from tools.docs_pages import command_parsers, helps, plain_references
 
 pytestmark = pytest.mark.slow  # the build takes half a minute
 
@@ -44,7 +44,9 @@ def test_every_command_has_its_help_with_its_exit_codes(site: Path) -> None:
     for command in (*scripts, "emb-replay estimate", "emb-train evaluate"):
         assert f">{command}<" in page
         assert f"usage: {command}" in page
-    assert page.count("exit codes") >= len(scripts)
+    for command, parser in command_parsers().items():
+        for title, text in helps(command, parser):
+            assert re.search("exit (codes|status)", text), title
 
 
 @pytest.mark.parametrize(

@@ -46,6 +46,8 @@ DIR contains actor.onnx (what emb-run takes: the actor with the best validation 
 metrics.jsonl and curve.png. The validation uses brakes that no training draws. A training for speeds finds a plan,
 lets the actor follow it, and improves that. Ctrl-C ends the training and keeps the best actor so far, or the actor that
 follows the best plan so far.
+
+exit codes: 0 done, 1 training diverged, 2 usage, 5 an ONNX file is refused, 130 interrupted (Ctrl-C)
 """
 EVALUATE_EPILOG = """\
 example:
@@ -61,6 +63,8 @@ true parameters.
 The optimum is the result of emb-design for the known brake. It exists for the plants euler and exact; a plant that
 differs from exact only in its instruments is compared with exact. It takes minutes for the first brake and 15 s for
 each further one. Ctrl-C ends the evaluation and shows the plants so far.
+
+exit codes: 0 done, 2 usage, 5 a policy is refused, 130 interrupted (Ctrl-C)
 """
 
 

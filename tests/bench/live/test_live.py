@@ -445,6 +445,28 @@ def test_an_empty_folder_says_what_to_type(tmp_path: Path) -> None:
     assert said == "no log in my runs yet: in another terminal, emb-run --iface sim --log 'my runs/'"
 
 
+@pytest.mark.parametrize(
+    ("named", "listening", "other"),
+    [([], "127.0.0.1", "127.0.0.2"), (["--host", "127.0.0.2"], "127.0.0.2", "127.0.0.1")],
+)
+def test_the_address_that_is_named_is_listened_at_and_no_other(
+    tmp_path: Path, named: list[str], listening: str, other: str
+) -> None:
+    command = [sys.executable, "-m", "emb_bench.cli.replay", "live", "--port", "0", *named, str(tmp_path)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stderr is not None
+            address = process.stderr.readline().split("http://")[1].split()[0]
+            port = int(address.strip("/").split(":")[1])
+            with connect(f"ws://{address}", subprotocols=PAGE) as page:
+                assert "empty" in json.loads(page.recv(SECONDS))
+            socket.create_connection((listening, port), timeout=SECONDS).close()
+            with pytest.raises(ConnectionRefusedError):
+                socket.create_connection((other, port), timeout=SECONDS)
+        finally:
+            process.kill()
+
+
 def test_a_viewer_may_subscribe_to_what_is_advertised_and_nothing_else(server: Server, shipped: Path) -> None:
     with connect(server.address, subprotocols=PROTOCOL) as viewer:
         topics = subscribe_to_everything_once_served(server, viewer, shipped)
@@ -460,6 +482,7 @@ def test_a_viewer_may_subscribe_to_what_is_advertised_and_nothing_else(server: S
 
 
 def test_one_viewer_too_many_is_told_so_and_the_others_stay(server: Server) -> None:
+    assert (MOST_VIEWERS, LARGEST_REQUEST, MOST_WAITING, MOST_SAID) == (16, 64 << 10, 32 << 20, 1000)  # SECURITY.md
     with ExitStack() as held:
         viewers = [held.enter_context(connect(server.address, subprotocols=PROTOCOL)) for _ in range(MOST_VIEWERS)]
         assert all(json.loads(viewer.recv(SECONDS))["op"] == "serverInfo" for viewer in viewers)

@@ -15,8 +15,10 @@ import can.logconvert
 import cantools
 import pytest
 
+from emb_bench.cli.replay import main as emb_replay
 from emb_bench.logs.can_files import McapReader
 from emb_bench.logs.log import read_log
+from emb_runtime.errors import EXIT_DONE
 from emb_runtime.log.ring_buffer import FrameRecord
 from emb_runtime.records import Frame
 
@@ -107,6 +109,7 @@ def test_a_log_without_its_first_chunk_has_the_frames_of_the_others(
     assert found
     assert found == whole[-len(found) :]
     assert "is damaged" in caplog.text
+    assert emb_replay(["export", str(path), "--topic", "/can/rx", "-o", str(path.with_suffix(".csv"))]) == EXIT_DONE
 
 
 def test_the_base_install_is_enough_and_the_parsers_do_not_load_python_can(path: Path) -> None:

@@ -6,6 +6,7 @@ import os
 import socket
 import stat
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -42,6 +43,26 @@ def test_what_is_no_regular_file_is_refused_and_nobody_waits_for_it(
     with pytest.raises(OSError, match=said):
         open_regular(path)
     assert open_files() == before
+
+
+def test_what_was_opened_is_judged_and_read_whatever_has_its_name_now(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, plain = tmp_path / "given", os.open
+
+    def replaced(name: str, flags: int) -> int:
+        opened = plain(name, flags)
+        path.unlink()
+        then(path)
+        return opened
+
+    monkeypatch.setattr(os, "open", replaced)
+    path.write_bytes(b"what was there")
+    then: Callable[[Path], object] = os.mkfifo
+    assert read_bytes(path, 20) == b"what was there"
+    then = partial(Path.write_bytes, data=b"what is there")  # In the place of the pipe
+    with pytest.raises(OSError, match="expected a regular file, and it is a pipe"):
+        read_bytes(path, 20)
 
 
 def test_what_has_to_be_waited_for_is_an_error_and_not_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

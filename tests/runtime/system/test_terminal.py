@@ -82,6 +82,7 @@ DIRECTIONS = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}
 
 
 def test_a_string_from_outside_is_one_line_and_cut() -> None:
+    assert (LONGEST_STRING, LONGEST_MESSAGE) == (2000, 1000)  # SECURITY.md
     assert one_line("a\nb") == "a\\nb"
     assert one_line("x" * 1_000_000) == "x" * LONGEST_STRING + " … (1000000 characters)"
 
