@@ -587,7 +587,11 @@ def outcome(damage: Damage, change: Callable[[Path], object], path: Path, data: 
     path.write_bytes(data)
     change(path)
     ends, found = judge(path, whole)
-    assert ends in damage.allowed or path.read_bytes() == data, (damage.what, change, ends, found)
+    with path.open("rb") as file:
+        as_it_was = file.read(len(data)) == data  # Bytes behind its end are no part of it
+    assert ends in damage.allowed or as_it_was, (damage.what, change, ends, found)
+    said = found.log.missing if isinstance(found, Read) else found
+    assert damage.words in said, (damage.what, change, said)
     if damage.equal:
         assert isinstance(found, Read)
         assert found.numbers == whole.numbers, (damage.what, change)
@@ -601,6 +605,7 @@ class Damage(NamedTuple):
     changes: Sequence[Callable[[Path], object]]  # Each done to the file, which is whole before
     allowed: tuple[str, ...] = NOT_SILENT
     equal: bool = False  # What is read has the numbers of the whole log
+    words: str = ""  # In what is said to be missing, or why the log is refused
 
 
 def put(content: bytes) -> Callable[[Path], object]:
@@ -612,31 +617,43 @@ def damages(data: bytes, dice: random.Random) -> Iterator[Damage]:
     first, *_, (_, begin, end) = (r for r in records(data) if r[0] == Opcode.CHUNK)
     topics = ("/cycle", "/can/rx", "/can/tx", "/clock", "/safety")
     fields = [*(("/cycle", name) for name in CycleRecord._fields), ("/can/rx", "id"), ("/can/rx", "data")]
-    yield Damage("cut in the last chunk", [put(data[:at]) for at in range(begin, end)])
+    cut = "the file is cut at byte"
+    yield Damage("cut in the last chunk", [put(data[:at]) for at in range(begin, end)], words=cut)
     cuts = [*range(1, begin, 499), *range(end, len(data), 211)]
     yield Damage("cut elsewhere", [put(data[:at]) for at in cuts])
     yield Damage("one to four flipped bytes", [put(flipped(dice, data)) for _ in range(300)])
-    yield Damage("bytes gone, doubled or put elsewhere", [put(corrupt(dice, data)) for _ in range(100)], OUTCOMES)
+    yield Damage("bytes gone, doubled or put elsewhere", [put(corrupt(dice, data)) for _ in range(100)])
     yield Damage("a length or a field of a record lies", list(map(put, _lies(data))))
-    yield Damage("a chunk that unpacks to gigabytes", [put(spliced(data, c)) for c in _bombs()], (IN_PART,), True)
-    yield Damage("a huge record that is really there", [partial(_hole, data=data)], (IN_PART,), True)
+    for what, bombs, words in _bombs():
+        yield Damage(what, [put(spliced(data, bomb)) for bomb in bombs], (IN_PART,), True, words)
+    huge = [partial(_hole, data=data)]
+    yield Damage("a huge record that is really there", huge, (IN_PART,), True, "more than any of ours")
     malformed = [put(spliced(data, each)) for each in MALFORMED]
-    yield Damage("a malformed record", malformed, (COMPLETE, IN_PART), True)
+    yield Damage("a malformed record", malformed, (IN_PART,), True, "left out")
     missing = [partial(rewritten, change=without(*field)) for field in fields]
-    yield Damage("wrong schema: a field is missing", missing, (REFUSED,))
+    yield Damage("wrong schema: a field is missing", missing, (REFUSED,), words="have other fields: expected ")
     retyped = [_retyped(*field, "string") for field in fields]
     retyped += [_retyped(*field, kind) for field in SOME_FIELDS for kind in KINDS]
     yield Damage("wrong schema: a field of another kind", retyped, (COMPLETE, REFUSED))
     stamped = [_stamped(topic, stamp) for topic in topics for stamp in STAMPS]
     yield Damage("times that no run has", stamped, OUTCOMES)
-    empty = (b"", b"x", MAGIC, MAGIC * 2, bytes(1000), data[: first[1]] + END)
-    yield Damage("empty, without a message, or of another format", list(map(put, empty)), (REFUSED,))
-    later = [partial(rewritten, change=with_field(topic, "novelty", "int64")) for topic in ("", *topics)]
+    yield Damage("empty", [put(b"")], (REFUSED,), words="the file is empty")
+    yield Damage("of another format", [put(b"x"), put(bytes(1000))], (REFUSED,), words="not an MCAP file")
+    yield Damage("without a record", [put(MAGIC), put(MAGIC * 2)], (REFUSED,), words=cut)
+    yield Damage("without a message", [put(data[: first[1]] + END)], (REFUSED,), words="it holds none")
+    later = [
+        partial(
+            rewritten,
+            change=with_field(topic, "novelty", "int64"),
+            values=lambda _topic, n, row: {**row, "novelty": n + 1},
+        )
+        for topic in topics
+    ]
     new = put(spliced(data, record(0x90, b"anything")))
     yield Damage("of a later version: more fields, other records", [*later, new], (COMPLETE,), True)
-    yield Damage("two logs one after the other", [put(data * 2)], (IN_PART,), True)
+    yield Damage("two logs one after the other", [put(data * 2)], (IN_PART,), True, "the end of the file is not that")
     yield Damage("of another program", [partial(rewritten, library="other")], (COMPLETE,), True)
-    yield Damage("two runs in one", [partial(rewritten, runs=2)], (REFUSED,))
+    yield Damage("two runs in one", [partial(rewritten, runs=2)], (REFUSED,), words="this is not one run")
 
 
 def _lies(data: bytes) -> Iterator[bytes]:
@@ -651,14 +668,19 @@ def _lies(data: bytes) -> Iterator[bytes]:
     return (data[:at] + lie + data[at + len(lie) :] for at, lie in lies)
 
 
-def _bombs() -> Iterator[bytes]:
-    """Chunks that are small when packed, by what they are and what they claim to be."""
+def _bombs() -> Iterator[tuple[str, list[bytes], str]]:
+    """Chunks that are small when packed: what they claim to be, themselves, and what is said of them."""
     piece, packer = bytes(1 << 20), zstandard.ZstdCompressor().compressobj()
     untold = b"".join(packer.compress(piece) for _ in range(2048)) + packer.flush()
     honest = zstandard.ZstdCompressor().compressobj(size=256 << 20)
     told = b"".join(honest.compress(piece) for _ in range(256)) + honest.flush()
-    claims = (untold, 2 << 30), (untold, 2**63), (told, 256 << 20), (untold, 1000), (told, 1000)
-    return (record(Opcode.CHUNK, chunk(b"", size=size, packed=packed)) for packed, size in claims)
+    for what, claims, words in (
+        ("claims too much", [(untold, 2 << 30), (untold, 2**63), (told, 256 << 20)], "it claims to unpack from"),
+        ("claims too little", [(untold, 1000)], "the chunk at byte"),
+        ("claims another size than its frame", [(told, 1000)], "its frame claims to unpack to"),
+    ):
+        bombs = [record(Opcode.CHUNK, chunk(b"", size=size, packed=packed)) for packed, size in claims]
+        yield f"a chunk of gigabytes that {what}", bombs, words
 
 
 def _hole(path: Path, data: bytes) -> None:

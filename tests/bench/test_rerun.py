@@ -176,6 +176,8 @@ def test_a_run_with_any_fault_is_reproduced(
         return recorded(law, **{"steps": 500, **arguments})
 
     run: Any = loop_run(name, record)
+    fault = IN_LOOP[name].fault
+    assert fault is None or fault.name in run.journal.codes
     purpose = "homing" if name in OF_A_WAY_HOME else "experiment"
     assert_reproduced(again(run, *laws, on=benches[0], purpose=purpose), run)
 

@@ -12,8 +12,9 @@ for it, seconds of imports each; mutatest has had no release since 2022.
 Killed: a test fails, the module cannot be imported, the process dies, or it uses up its processor time. Before anything
 is believed, the tests must pass with the module unchanged and fail with every function of it raising.
 
-``--changed`` judges the modules that differ from a commit (``main``): they, their tests, or what all tests share,
-docstrings and comments apart. Where git does not know the commit all are judged.
+``--changed`` judges the modules whose verdict may differ from that at a commit (``main``): their tests have changed, or
+what all tests share and any of the modules, docstrings and comments apart. Where git does not know the commit all are
+judged.
 """
 
 from __future__ import annotations
@@ -124,11 +125,12 @@ def run(module: str, listed: bool) -> int:
 def differs(module: str, commit: str) -> bool:
     """Whether a module's verdict may be another one than at a commit.
 
-    It rests on the module, its tests and its entries in the list; on mutation itself, and on the bench and the drives
-    that the tests load.
+    It rests on the module, its tests and its entries in the list; on mutation itself, on the other modules, which its
+    tests call, and on what tests share: the bench, the drives, the scenarios and the stream of frames.
     """
-    files = [path_of(module), *(ROOT / name for name in tests_of(module)), *Path(__file__).parent.glob("*.py")]
+    files = [*map(path_of, TESTS), *(ROOT / name for name in tests_of(module)), *Path(__file__).parent.glob("*.py")]
     files += [ROOT / f"tests/{name}.py" for name in ("benches", "conftest", "drives", "independent", "laws")]
+    files += [ROOT / "tests/fuzz/stream.py", *(ROOT / "tests/scenarios").glob("*.py")]
     files += [path for path in (ROOT / "examples/drives").iterdir() if path.is_file()]
     files += [ROOT / RUNTIME / "conftest.py", path_of("config.bench"), path_of("config.bench").with_suffix(".toml")]
     if any(_without_words(path, path.read_text(encoding="utf-8")) != _at(commit, path) for path in files):

@@ -46,6 +46,7 @@ BY_FAULT = {scenario.fault: name for name, scenario in IN_LOOP.items()}
 
 def test_every_fault_has_a_scenario() -> None:
     assert BY_FAULT.keys() == {None, *Fault}
+    assert len(BY_FAULT) == len(IN_LOOP)  # a second one of a fault would not be played here
 
 
 @pytest.mark.parametrize("fault", [f for f, info in FAULTS.items() if info.latched], ids=lambda fault: fault.name)

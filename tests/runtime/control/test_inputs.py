@@ -99,6 +99,8 @@ def test_the_inputs_of_a_run_make_each_of_its_records_again(name: str, simulate:
         return simulate(law, journal=journal, **arguments)
 
     run = loop_run(name, record)
+    fault = IN_LOOP[name].fault
+    assert fault is None or fault.name in run.journal.codes
     core = {"homing": True} if given.get("homing") else {}
     assert_inputs_suffice(journal, given["law"], given.get("steps", run.bench.timing.horizon), run.bench, **core)
 

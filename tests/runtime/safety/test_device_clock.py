@@ -81,20 +81,22 @@ def test_any_sequence_of_pairs_is_judged_as_by_the_account(period_ns: int) -> No
             arrival_ns = BASE + device_ns + early_ns
             assert clock.learn(device_ns, arrival_ns) == account.learn(device_ns, arrival_ns)
         late_ns, off_ns, every = 0, 0, draw.choice((7, 20))
+        strays = seed % 4 == 0  # else the problem would nearly always be there within the first window
         for number in range(90):
             if number % every == 0:
                 late_ns = draw.choice((0, 0, 100, account.follows_ns - 1, account.follows_ns + 1, -account.follows_ns))
                 late_ns = draw.choice((late_ns, late_ns, allowed_ns, allowed_ns + 1, -allowed_ns))
-                off_ns = draw.choice(
-                    (0, 0, 0, quarter_ns, -quarter_ns, quarter_ns + 1, -quarter_ns - 1, period_ns // 2)
-                )
+                if strays:
+                    off_ns = draw.choice(
+                        (*[0] * 3, quarter_ns, -quarter_ns, quarter_ns + 1, -quarter_ns - 1, period_ns // 2)
+                    )
             stray = draw.random()
             elapsed_ns = draw.choice((1, 1, 1, 2, 7)) * period_ns + off_ns
-            if stray < 0.03:
+            if stray < 0.01:
                 elapsed_ns = draw.choice((0, -1, 1, quarter_ns, quarter_ns + 1, 3 * quarter_ns))
             device_ns += elapsed_ns
             arrival_ns = account.reference_ns + device_ns + late_ns
-            if 0.03 < stray < 0.05:
+            if 0.01 < stray < 0.02:
                 arrival_ns = account.reference_ns + device_ns - draw.choice((allowed_ns, allowed_ns + 1))
             seen_ns = arrival_ns + draw.choice((0, 0, 8 * period_ns))
             expected = account.judge(device_ns, arrival_ns, seen_ns)

@@ -293,6 +293,7 @@ SLEW = 1500.05
 """A/s. The shipped bench's never binds: it lets the current turn round in one period. No whole number of steps."""
 SLEW_STEPS = 7_501  # Of the current signal's 0.2 mA, the one that rounding may cost included
 STEPS = [MS] * 6 + [0, MS // 5, 5 * MS, 7 * MS - 1, 7 * MS, 1000 * MS, -MS]  # Times between two commands [ns]
+HURRIED = [0, MS // 5, MS]  # So that the rate limit binds
 
 
 @pytest.mark.parametrize("seed", range(60))
@@ -313,12 +314,14 @@ def play(draw: Random) -> Played:
         bus.append(frame)
 
     watched, account = Guard(layout, bench, send, limit=limit), Account(min(6.0, bench.limits.current, limit))
-    now_ns = draw.randint(0, 10**12)
+    now_ns, steps = draw.randint(0, 10**12), draw.choice([STEPS, HURRIED])
     for _ in range(100):
-        now_ns += draw.choice(STEPS)
+        now_ns += draw.choice(steps)
         state = draw.choice([*RunState, *[ACTIVE] * 20])
         age_ns = draw.choice([0, MS // 3, MS // 3, MS, 2 * MS, 2 * MS + 1, -MS, -MS - 1, 10 * MS])
-        frame, fails, said = attempt(draw, account), chance(draw, 3), ""
+        right = steps is HURRIED and not chance(draw, 20)  # else no 24 would leave in 20 periods
+        frame = legal(draw, account) if right else attempt(draw, account)
+        age_ns, fails, said = 0 if right else age_ns, chance(draw, 3), ""
         demand(watched.next_counter == account.expected()[0], "next counter", watched.next_counter)
         demand(watched.too_fast(now_ns) == account.too_fast(now_ns), "too fast", now_ns, account)
         failing.append(fails)
@@ -347,6 +350,15 @@ def without_numbers(text: str) -> str:
     return re.sub(r"-?\d+(\.\d+)?", "#", text)
 
 
+def legal(draw: Random, account: Account) -> Frame:
+    """A command that only the rate may forbid, or a stop frame, which nothing does."""
+    counter, answers, last = account.expected()
+    enable = not chance(draw, 15)
+    towards = draw.choice([last, last + SLEW_STEPS, last - SLEW_STEPS])
+    raw = min(max(towards, -account.limit), account.limit) if enable else 0
+    return Frame(COMMAND, protected(COMMAND, struct.pack("<BhB", counter | answers << 4, raw, enable)))
+
+
 def attempt(draw: Random, account: Account) -> Frame:
     """A command that is nearly always nearly right."""
     if chance(draw, 3):
@@ -358,7 +370,8 @@ def attempt(draw: Random, account: Account) -> Frame:
         answers, last = draw.randint(0, 15), 0
     enable = not chance(draw, 15)
     near = last + draw.choice([-1, 1]) * draw.choice([0, 100, SLEW_STEPS - 1, SLEW_STEPS, SLEW_STEPS, SLEW_STEPS + 1])
-    raw = draw.choice([near, near, near, near, draw.randint(-32_768, 32_767), 30_000, -30_001, 10_001])
+    most = account.limit
+    raw = draw.choice([*[near] * 4, draw.randint(-32_768, 32_767), most, -most, most + 1, -most - 1])
     if not enable and not chance(draw, 20):
         raw = 0
     body = struct.pack("<BhB", counter | answers << 4, min(max(raw, -32_768), 32_767), enable)
@@ -377,7 +390,7 @@ class Account:
 
     def __init__(self, limit: float) -> None:
         self.passed = self.rejected = 0
-        self._limit = round(limit / 2e-4)
+        self.limit = round(limit / 2e-4)
         self._last: tuple[int, int, int] | None = None
         self._sample_ns = 0
         self._sent_ns: list[int] = []
@@ -415,7 +428,7 @@ class Account:
         next_counter, next_answers, last = self.expected()
         if self._last is not None and values["Counter"] != next_counter:
             return "counter # does not follow #"
-        if abs(raw) > self._limit:
+        if abs(raw) > self.limit:
             return "# A is beyond # A"
         if not values["Enable"]:
             return "disabled, but with # A" if raw else ""
