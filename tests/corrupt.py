@@ -675,12 +675,12 @@ def _bombs() -> Iterator[tuple[str, list[bytes], str]]:
     honest = zstandard.ZstdCompressor().compressobj(size=256 << 20)
     told = b"".join(honest.compress(piece) for _ in range(256)) + honest.flush()
     for what, claims, words in (
-        ("claims too much", [(untold, 2 << 30), (untold, 2**63), (told, 256 << 20)], "it claims to unpack from"),
-        ("claims too little", [(untold, 1000)], "the chunk at byte"),
-        ("claims another size than its frame", [(told, 1000)], "its frame claims to unpack to"),
+        ("that claims too much", [(untold, 2 << 30), (untold, 2**63), (told, 256 << 20)], "it claims to unpack from"),
+        ("that claims too little", [(untold, 1000)], "the chunk at byte"),
+        ("with another size than its frame", [(told, 1000)], "its frame claims to unpack to"),
     ):
         bombs = [record(Opcode.CHUNK, chunk(b"", size=size, packed=packed)) for packed, size in claims]
-        yield f"a chunk of gigabytes that {what}", bombs, words
+        yield f"a chunk of gigabytes {what}", bombs, words
 
 
 def _hole(path: Path, data: bytes) -> None:
