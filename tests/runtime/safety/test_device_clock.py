@@ -133,6 +133,14 @@ def test_latencies_below_the_allowance_never_blame_a_quartz(latencies: list[int]
         assert clock.time_problem(device_ns + n * (MS + ppm), arrival_ns, arrival_ns) == ""
 
 
+def test_samples_a_quarter_of_a_period_apart_are_off_the_grid() -> None:
+    clock, device_ns = learned()
+    for n in range(1, 20):
+        at_ns = device_ns + n * (MS // 4)
+        clock.time_problem(at_ns, BASE + at_ns, BASE + at_ns)
+    assert clock.problem == "its samples are 0.250 ms apart, the bench's period is 1 ms"
+
+
 def test_samples_on_the_grid_forgive_those_off_it() -> None:
     clock, device_ns = learned()
     for n in range(50):
