@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 from scipy import special
 
 from emb_bench.brake.motion import Floats
-from emb_bench.estimate.effects import LAGGING, Shown, Simulated
+from emb_bench.estimate.effects import Shown, Simulated
 from emb_bench.estimate.prediction import Problem, by_experiment
 from emb_bench.estimate.records import OUTPUTS, Disturbance, Independence, ModelValidation, Whiteness
-from emb_bench.estimate.suspects import DEPENDENT, score
+from emb_bench.estimate.suspects import DEPENDENT, cause, score
 
 Bools = NDArray[np.bool_]
 
@@ -87,7 +87,8 @@ def examine(
         independence,
         *score(problem, z, found, model, seen, chi2 / freedom, disturbed=disturbed),
     )
-    return _judged(tested, disturbance)
+    judged = _judged(tested, disturbance)
+    return replace(judged, cause=cause(judged, problem.bench.machine))
 
 
 def _share(disturbance: Disturbance | None) -> float:
@@ -111,7 +112,7 @@ def significant(p_values: Mapping[str, float]) -> frozenset[str]:
 
 
 def _judged(m: ModelValidation, disturbance: Disturbance | None) -> ModelValidation:
-    """Tests with those that reject the model, and the suspects among them."""
+    """Tests with those that reject the model."""
     tests = {"size": m.chi2_p} | {f"current of {name}": test.p_value for name, test in m.independence.items()}
     tests |= {f"score of {suspect.name}": suspect.p_value for suspect in m.suspects}
     if m.together is not None:
@@ -127,11 +128,6 @@ def _judged(m: ModelValidation, disturbance: Disturbance | None) -> ModelValidat
     return replace(
         m,
         alarming=alarming,
-        suspected=tuple(
-            s
-            for s in m.suspects
-            if s.possible and f"score of {s.name}" in alarming and (s.name != LAGGING or s.observer)
-        ),
         coloured=tuple(coloured),
         disturbance=disturbance if disturbance is not None and disturbance.p_value < share else None,
     )

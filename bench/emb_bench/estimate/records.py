@@ -201,6 +201,18 @@ class Suspect:
     fall: float = 0.0  # Of χ² with it, to first order; of a term of the clamping force's curve with both terms
 
 
+class Cause(NamedTuple):
+    """The effect that is most probably why the model does not fit."""
+
+    suspect: Suspect
+    sigmas: float  # Of its score; of a curve with both terms
+    share: float | None
+    """Part of the misfit that it takes, to first order: 1 where none is left, None where the residuals' size is no
+    alarm."""
+    is_curve: bool  # With the other term of the clamping force's curve
+    possible: bool  # The brake can have it, as far as its amount can tell
+
+
 @dataclass(frozen=True)
 class JointScore:
     """Score test of all suspects together."""
@@ -249,9 +261,9 @@ class ModelValidation:
     suspects: tuple[Suspect, ...]  # Most suspicious first
     budget: tuple[Contribution, ...]  # Effects that the total allows for
     together: JointScore | None  # None without a suspect
-    suspected: tuple[Suspect, ...] = ()  # Those of a possible amount that an alarm is about
     alarming: frozenset[str] = frozenset()
     """Tests that reject the model: ``size``, ``scores``, and ``current of``, ``whiteness of``, ``score of`` a name."""
+    cause: Cause | None = None  # None without an alarm about an effect
     coloured: tuple[str, ...] = ()  # Outputs whose residuals are correlated in time
     disturbance: Disturbance | None = None  # A significant one, of a method that whitens the residuals
 

@@ -20,12 +20,13 @@ import numpy as np
 from scipy import special
 
 from emb_bench.brake.motion import Floats
-from emb_bench.brake.parameters import CURVED
+from emb_bench.brake.parameters import CURVED, PARAMETERS
+from emb_bench.config.machine import Machine
 from emb_bench.estimate.average import SHARES, Average, Influence, average, unaveraged
 from emb_bench.estimate.derived_velocity import derived
 from emb_bench.estimate.effects import DRIFTS, EFFECTS, LAGGING, Shown, columns, possible
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Contribution, JointScore, Suspect
+from emb_bench.estimate.records import Cause, Contribution, JointScore, ModelValidation, Suspect
 from emb_runtime.config.bench import PARAMETER_NAMES
 
 PRESENT = 0.5  # Probability, before any experiment, that a brake has a certain one of the effects that are not certain
@@ -34,7 +35,8 @@ DISTURBED = 10.0
 """Factor of what is known of drifts before an experiment in which something disturbs the brake: it may be a drift,
 which the random walk of a filter follows without an alarm."""
 
-ALIKE = 2.0  # Difference of two suspects' squared scores below which they are hardly distinguished
+ALIKE = 0.8  # Ratio of the scores of two suspects from which on both are about as sure
+DISTINGUISHED = 2.0  # Difference of two suspects' squared scores below which they are hardly distinguished
 
 DEPENDENT = 1e-6  # share of a regressor beside the others below which it is one of them
 
@@ -103,6 +105,46 @@ def score(
     return _with_observer(_ranked(suspects), problem), budget, JointScore(statistic, rank, p_value)
 
 
+def cause(m: ModelValidation, machine: Machine | None) -> Cause | None:
+    """The effect that explains a misfit, or the one that explains most of it; None without a significant one.
+
+    The ``machine`` is that of a bench that has no brake. A score test is of first order: where an effect leaves a
+    misfit, its amount says little, not even that a brake cannot have it.
+    """
+    lagging = next((s for s in m.suspects if s.observer and f"score of {s.name}" in m.alarming), None)
+    if lagging is not None:
+        return _cause(m, lagging, possible=True)
+    found = [s for s in m.suspects if s.name in CURVED or (f"score of {s.name}" in m.alarming and s.name != LAGGING)]
+    if not any(f"score of {s.name}" in m.alarming for s in found):
+        return None
+    possible = [s for s in found if s.possible or s.name in CURVED]
+    # Where none is left, or the size is no alarm, the amount must be one that a brake can have.
+    if explaining := [s for s in found if _share(m, s) in (None, 1.0)]:
+        possible = found = [s for s in possible if s in explaining]
+    if not found:
+        return None
+    most = max(s.fall for s in found)
+    alike = [s for s in possible if s.fall >= ALIKE**2 * most]
+    best = max(s.fall for s in alike or found) - DISTINGUISHED * m.ratio
+    # A recording is not made again: there an effect that can be estimated is named, if it is as sure.
+    named = [s for s in alike if machine is not None and s.name in PARAMETERS]
+    first = [*named, *(s for s in alike or found if s.fall >= best)][0]
+    return _cause(m, first, possible=first in possible)
+
+
+def _cause(m: ModelValidation, s: Suspect, *, possible: bool) -> Cause:
+    square = s.fall / max(m.ratio, 1e-300)
+    return Cause(s, square**0.5, _share(m, s), square - s.sigmas**2 > DISTINGUISHED, possible)
+
+
+def _share(m: ModelValidation, s: Suspect) -> float | None:
+    """Share of a misfit that an effect takes, as in :class:`Cause`."""
+    if "size" not in m.alarming:
+        return None
+    left = (m.chi2 - s.fall) / max(m.freedom - 1, 1)
+    return 1.0 if left <= m.expected[1] else min(s.fall / (m.chi2 - m.freedom), 0.999)
+
+
 def basis_and_inverse(jacobian: Floats) -> tuple[Floats, Floats]:
     """An orthonormal basis and the pseudo-inverse of a tall matrix whose columns differ in scale."""
     lengths = np.linalg.norm(jacobian, axis=0)
@@ -156,7 +198,7 @@ def _ranked(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
         return float(f"{s.p_value:.6g}"), -float(f"{suspicion:.6g}")
 
     ordered = sorted(found, key=rank)
-    least = ordered[0].sigmas ** 2 - ALIKE
+    least = ordered[0].sigmas ** 2 - DISTINGUISHED
     alike = [s for s in ordered if s.sigmas**2 >= least and s.p_value < 0.5]
     alike.sort(key=lambda s: list(EFFECTS).index(s.name))
     return (*alike, *(s for s in ordered if s not in alike))

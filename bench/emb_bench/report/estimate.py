@@ -101,7 +101,7 @@ def _limits(study: Study) -> Iterator[str]:
         ]
         if not hints:
             yield f"effects     {len(tested)} tested, none above {NOTICED:g} sigma"
-        elif not e.validation.suspected:
+        elif e.validation.fits:
             yield f"effects     {', '.join(hints[:4])} sigma, below the level of an alarm"
 
 

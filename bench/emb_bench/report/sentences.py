@@ -11,19 +11,19 @@ from emb_bench.analysis.drift import Drift, Earlier
 from emb_bench.analysis.options import names_of
 from emb_bench.analysis.records import Candidate, HeldOut, Profile
 from emb_bench.analysis.study import Code, Stop, Study, verdict
-from emb_bench.brake.parameters import CURVED, PARAMETERS, quantity
+from emb_bench.brake.parameters import quantity
 from emb_bench.config.bench import Bench
 from emb_bench.config.machine import Machine
-from emb_bench.estimate.effects import EFFECTS, LAGGING, shown_as
+from emb_bench.estimate.effects import EFFECTS, shown_as
 from emb_bench.estimate.estimate import OF_THE_BENCH, Estimate
 from emb_bench.estimate.records import (
     DONE,
     FEWEST_WINDOWS,
     WITHOUT_GAPS,
+    Cause,
     Contribution,
     Derived,
     ModelValidation,
-    Suspect,
 )
 from emb_bench.experiment.experiment import Lack
 from emb_bench.information.evaluation import default_model
@@ -54,8 +54,6 @@ TERMS = {
 
 
 LONGEST_NAME = 80  # Characters of a name from another file
-ALIKE = 0.8  # Ratio of the sigmas of two suspects from which on both are about as sure
-DISTINGUISHED = 2.0  # Difference of their squares from which on one is the better
 EXPLAINS = 3.0  # Standard deviations from which on a parameter that is held fixed may explain a misfit
 
 
@@ -245,14 +243,14 @@ def alarms(e: Estimate) -> list[str]:
     found = [] if m.fits else faults(e)
     if found:
         pass
-    elif m.suspected and m.suspected[0].observer:
-        found.append(explained(m.suspected[0], m, e.bench.machine))
+    elif m.cause is not None and m.cause.suspect.observer:
+        found.append(explained(m.cause, e.bench.machine))
     elif left := left_fixed(e):
         names = ", ".join(left)
         one = f"{names}, which is held fixed," if len(left) == 1 else f"one of {names}, which are held fixed,"
         found.append(f"{one} may explain it; remedy: estimate {_every(e)}: leave --params out")
-    elif said := _cause(e):
-        found.append(said)
+    elif m.cause is not None:
+        found.append(_cause(m.cause, e))
     elif scored:
         found.append("no effect explains it in an amount that is possible: look for a fault in the data")
     elif m.together is not None and "scores" in m.alarming:
@@ -276,35 +274,11 @@ def alarms(e: Estimate) -> list[str]:
     return found
 
 
-def _cause(e: Estimate) -> str:
-    """The effect that explains a misfit, or the one that explains most of it; empty without a significant one.
-
-    A score test is of first order: where an effect leaves a misfit, its amount says little, not even that a brake
-    cannot have it.
-    """
-    m, machine = e.validation, e.bench.machine
-    found = [s for s in m.suspects if s.name in CURVED or (f"score of {s.name}" in m.alarming and s.name != LAGGING)]
-    if not any(f"score of {s.name}" in m.alarming for s in found):
-        return ""
-    possible = [s for s in found if s.possible or s.name in CURVED]
-    if explaining := [s for s in found if left_by(s, m) <= m.expected[1]]:
-        possible = found = [s for s in possible if s in explaining]
-    if not found:
-        return ""
-    most = max(s.fall for s in found)
-    alike = [s for s in possible if s.fall >= ALIKE**2 * most]
-    best = max(s.fall for s in alike or found) - DISTINGUISHED * m.ratio
-    # A recording is not made again: there an effect that can be estimated is named, if it is as sure.
-    named = [s for s in alike if machine is not None and s.name in PARAMETERS]
-    first = [*named, *(s for s in alike or found if s.fall >= best)][0]
-    said = explained(first, m, machine)
+def _cause(cause: Cause, e: Estimate) -> str:
+    """The effect that explains a misfit, or most of it, and what else to look for."""
+    said = explained(cause, e.bench.machine)
     said += _window(e) if "--nuisance" in said else ""
-    return said if first in possible else f"{said}; or look for a fault in the data"
-
-
-def left_by(s: Suspect, m: ModelValidation) -> float:
-    """χ²/n that an effect leaves, to first order."""
-    return (m.chi2 - s.fall) / max(m.freedom - 1, 1)
+    return said if cause.possible else f"{said}; or look for a fault in the data"
 
 
 def _window(e: Estimate) -> str:
@@ -376,23 +350,30 @@ def _coloured(m: ModelValidation) -> str:
     return f"the residuals of the {' and '.join(m.coloured)} are correlated in time (Ljung-Box {tested})"
 
 
-def explained(s: Suspect, m: ModelValidation, machine: Machine | None = None) -> str:
-    """A suspect in words that lead to the remedy; ``machine`` is that of a bench that has no brake."""
+def explained(cause: Cause, machine: Machine | None = None) -> str:
+    """A cause in words that lead to the remedy; ``machine`` is that of a bench that has no brake.
+
+    Its amount is left out where the effect leaves a misfit: of first order, it says little there.
+    """
+    s = cause.suspect
     if s.observer:
         return derived_velocity(s.observer, machine)
-    effect, unit, left = EFFECTS[s.name], shown_as(s, machine).unit, left_by(s, m)
-    said, sigmas = effect.effect, math.sqrt(s.fall / m.ratio)
+    effect, unit = EFFECTS[s.name], shown_as(s, machine).unit
+    said, is_part = effect.effect, cause.share is not None and cause.share < 1.0
     for parameter in PARAMETER_NAMES:
         said = said.replace(parameter, quantity(machine, parameter).name)
-    if sigmas**2 - s.sigmas**2 > DISTINGUISHED:  # with the other term of the curve
+    if cause.is_curve:
         said = "a stiffness with a quadratic and a cubic term"
-    elif s.possible:
+    elif s.possible and not is_part:
         said += f" of about {plain(s.value, 2)} {unit}" if unit else f" of about {in_percent(s.value)}"
     remedy = effect.remedy
     if machine is not None and "--model" in remedy:  # the plant of a recording is that of its map
         remedy = "leave [signals.velocity] out of the map"
-    whole = "it" if left <= m.expected[1] else f"{percent(min(s.fall / (m.chi2 - m.freedom), 0.999))} of it"
-    return f"{said} explains {whole} ({sigmas:.0f} sigma); remedy: {remedy}"
+    if cause.share is None:
+        does = "is the most significant"
+    else:
+        does = f"explains {percent(cause.share)} of it" if is_part else "explains it"
+    return f"{said} {does} ({cause.sigmas:.0f} sigma); remedy: {remedy}"
 
 
 def derived_velocity(observer: Derived, machine: Machine | None) -> str:

@@ -14,6 +14,7 @@ from emb_bench.analysis.stages import make_study
 from emb_bench.analysis.study import Code, Result, Study, Tone, verdict
 from emb_bench.information.identifiability import Doubt
 from emb_bench.logs.log import read_log
+from emb_bench.report.estimate import text
 
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.benches import SENSOR_BENCH  # isort: skip
@@ -110,6 +111,16 @@ def test_of_runs_side_by_side_the_worst_counts_whatever_their_order(study: Study
         for order in ((one, other), (other, one)):
             runs = tuple(replace(own.runs[0], alone=own) for own in order)
             assert verdict(replace(study, runs=runs, joint=None))[:2] == (code, tone)
+
+
+def test_no_effect_is_below_the_level_of_an_alarm_where_the_model_does_not_fit(study: Study) -> None:
+    def hinted(study: Study) -> Study:
+        e = study.estimate
+        suspects = (replace(e.validation.suspects[0], sigmas=2.9, p_value=0.02, possible=True),)
+        return replace(study, joint=replace(e, validation=replace(e.validation, suspects=suspects)))
+
+    assert "below the level of an alarm" in text(hinted(study), verbose=True)
+    assert "below the level of an alarm" not in text(hinted(misfit(study)), verbose=True)
 
 
 def test_nothing_is_good_without_an_estimate_or_of_a_simulated_brake(study: Study) -> None:

@@ -50,7 +50,7 @@ def test_a_model_that_does_not_fit_says_what_it_may_lack(log: Log, replay: Repla
     gentle = FunctionActor(lambda *sample: 0.8 * square(*sample))  # no angle below contact, which would tell the offset
     path = log("offset.mcap", "plant=offset", actor=gentle)
     misfit = replay.document(path, "--model", "exact", "--systematic", "none")["misfit"]
-    first = misfit["suspected"][0]
+    first = misfit["cause"]["suspect"]
     assert (first["name"] in ("contact", "offset"), first["value"] > 0.0) == (True, True)
     along = replay.document(path, "--model", "exact")
     assert along["model_fits"]

@@ -58,14 +58,17 @@ def test_its_column_is_the_finite_difference_of_a_brake_that_drifts(bench: Bench
     ("name", "method"),
     [(name, method) for name in PARAMETER_NAMES for method in ("oem", "pem") if (name, method) != ("k_1", "pem")],
 )
-def test_a_parameter_that_drifts_is_named_with_its_size_and_a_remedy(bench: Bench, name: str, method: str) -> None:
+def test_a_parameter_that_drifts_is_found_with_its_size_and_named_with_a_remedy(
+    bench: Bench, name: str, method: str
+) -> None:
     data = drifting(bench, "square:period=0.2", name, SIZES[name], seed=3)
     m = fit(bench, "exact", [data], method=method).validation
     assert not m.fits
-    assert m.suspected[0].name == f"{name}_drift"
-    assert m.suspected[0].value == pytest.approx(SIZES[name], rel=0.3)
-    said = explained(m.suspected[0], m)
-    assert f"a change of {name} over the run of about" in said
+    assert m.cause is not None
+    assert m.cause.suspect.name == f"{name}_drift"
+    assert m.cause.suspect.value == pytest.approx(SIZES[name], rel=0.3)
+    said = explained(m.cause)
+    assert f"a change of {name} over the run " in said
     assert "shorter" in said
 
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 import pytest
 
 from emb_bench.config.bench import Bench
-from emb_bench.report.sentences import alarms, left_by
+from emb_bench.estimate.records import Cause, Suspect
+from emb_bench.report.sentences import alarms, explained
 
 from tests.bench.measurements import currents_of, fit, record  # isort: skip
 
@@ -16,13 +17,16 @@ from tests.bench.measurements import currents_of, fit, record  # isort: skip
     ("plant", "text", "said"),
     [
         ("stribeck", "square:period=0.2", "a static friction beyond T_c of about 20 % explains it (24 sigma)"),
-        ("late", "chirp", "a delay of the commands of about 1 samples explains 99 % of it (31 sigma)"),
+        ("late", "chirp", "a delay of the commands explains 99 % of it (31 sigma)"),
     ],
 )
 def test_an_effect_explains_a_misfit_only_where_none_is_left(bench: Bench, plant: str, text: str, said: str) -> None:
     e = fit(bench, "exact", [record(bench, bench.plant(plant), currents_of(bench, text))])
     assert alarms(e)[0].startswith(said)
-    assert (left_by(e.validation.suspects[0], e.validation) > e.validation.expected[1]) is ("% of it" in said)
+    m = e.validation
+    assert m.cause is not None
+    left = (m.chi2 - m.cause.suspect.fall) / (m.freedom - 1)
+    assert (m.cause.share == 1.0) is (left <= m.expected[1]) is ("% of it" not in said)
 
 
 @pytest.mark.parametrize("text", ["chirp", "square:period=0.2"])
@@ -38,8 +42,35 @@ def test_two_terms_of_a_curve_that_nearly_cancel_are_named_together(
     assert "remedy: estimate it as well: --nuisance quadratic,cubic" in said
 
 
-def test_one_term_of_a_curve_that_explains_it_alone_is_named_with_its_amount(bench: Bench) -> None:
+@pytest.mark.parametrize(
+    ("quadratic", "said"),
+    [
+        (0.0005, "a quadratic stiffness of about 0.00048 1/rad explains it (28 sigma)"),
+        (0.0001, "a quadratic stiffness of about 8.3 × 10⁻⁵ 1/rad is the most significant (10 sigma)"),
+    ],
+)
+def test_one_term_of_a_curve_is_named_with_its_amount_and_explains_what_is_too_large(
+    bench: Bench, quadratic: float, said: str
+) -> None:
+    """Where the residuals are not too large, there is no amount of a misfit that it could explain."""
     exact = bench.plant("exact")
-    curved = replace(exact, mechanics=exact.mechanics._replace(quadratic=0.0005))
-    said = alarms(fit(bench, exact, [record(bench, curved, currents_of(bench, "chirp"))]))[0]
-    assert said.startswith("a quadratic stiffness of about 0.00048 1/rad explains it (28 sigma)")
+    curved = replace(exact, mechanics=exact.mechanics._replace(quadratic=quadratic))
+    e = fit(bench, exact, [record(bench, curved, currents_of(bench, "chirp"))])
+    assert alarms(e)[0].startswith(said)
+    assert ("size" in e.validation.alarming) is ("explains" in said)
+
+
+@pytest.mark.parametrize(
+    ("share", "is_curve", "said"),
+    [
+        (1.0, False, "a quadratic stiffness of about 0.002 1/rad explains it (9 sigma); remedy: "),
+        (0.87, False, "a quadratic stiffness explains 87 % of it (9 sigma); remedy: "),
+        (None, False, "a quadratic stiffness of about 0.002 1/rad is the most significant (9 sigma); remedy: "),
+        (1.0, True, "a stiffness with a quadratic and a cubic term explains it (9 sigma); remedy: "),
+    ],
+)
+def test_a_cause_is_worded_with_its_amount_unless_it_leaves_a_misfit(
+    share: float | None, is_curve: bool, said: str
+) -> None:
+    cause = Cause(Suspect("quadratic", 0.002, 9.0), 9.0, share, is_curve, possible=True)
+    assert explained(cause).startswith(said)
