@@ -390,7 +390,7 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], type[Exception], str]] = {
     "fisher_information(u, theta='true')": (
         lambda s: api.fisher_information(CURRENTS, theta="true"),
         UsageError,
-        "true parameters",
+        "--theta: expected nominal, name=value or a file",
     ),
     "fisher_information(u, plant=, model=)": (
         lambda s: api.fisher_information(CURRENTS, plant="exact", model="exact"),
