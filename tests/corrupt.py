@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import multiprocessing
 import os
 import random
 import re
@@ -20,6 +19,7 @@ import struct
 import sys
 import tempfile
 import time
+import traceback
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -772,20 +772,31 @@ def command(hostile: Hostile, folder: Path, longest: float = 60.0) -> Judged:
     arguments = [a.replace("FILE", str(path)).replace("OUT", str(folder / "out")) for a in hostile.command[1:]]
     program: Callable[[list[str]], int] = {"emb-run": run, "emb-replay": replay}[hostile.command[0]]
     with tempfile.TemporaryFile() as said:
-        process = multiprocessing.get_context("fork").Process(target=_become, args=(program, arguments, said.fileno()))
-        process.start()
-        assert process.pid is not None
-        code, usage = _wait(process.pid, longest)
+        pid = os.fork()  # a Process of multiprocessing that another call has waited for would keep its descriptors
+        if pid == 0:
+            _become(program, arguments, said.fileno())
+        code, usage = _wait(pid, longest)
         said.seek(0)
         text = said.read(1 << 20).decode("utf-8", "replace")
     return Judged(code, usage.ru_utime + usage.ru_stime, usage.ru_maxrss << 10, text)
 
 
 def _become(program: Callable[[list[str]], int], arguments: list[str], output: int) -> None:
-    for descriptor in (1, 2):
-        os.dup2(output, descriptor)
-    sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
-    sys.exit(program(arguments))
+    code = 111
+    try:
+        for descriptor in (1, 2):
+            os.dup2(output, descriptor)
+        sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
+        try:
+            code = program(arguments)
+        except SystemExit as err:
+            code = int(err.code or 0)
+        except BaseException:
+            traceback.print_exc()
+        sys.stdout.flush()
+        sys.stderr.flush()
+    finally:
+        os._exit(code)
 
 
 def _wait(pid: int, longest: float) -> tuple[int, resource.struct_rusage]:

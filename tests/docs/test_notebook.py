@@ -36,7 +36,11 @@ def executed(folder: Path) -> Any:
 def texts(cell: Any) -> list[tuple[str, str]]:
     """What a cell shows, without its pictures: the kind of each output and its text."""
     found = [(o.output_type, kind, text) for o in cell.outputs for kind, text in sorted(o.get("data", {}).items())]
-    found += [(output.output_type, output.name, output.text) for output in cell.outputs if "text" in output]
+    streams: dict[str, str] = {}  # a busy kernel sends one in several parts
+    for output in cell.outputs:
+        if "text" in output:
+            streams[output.name] = streams.get(output.name, "") + output.text
+    found += [("stream", name, text) for name, text in streams.items()]
     return [(f"{output} {kind}", "a picture" if kind.startswith("image/") else text) for output, kind, text in found]
 
 
