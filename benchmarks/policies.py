@@ -119,7 +119,7 @@ def told(bench: Bench, plant: str, draws: Sequence[Draw], outcome: Outcome, pool
         return intervals(bench, plant, PARAMETER_NAMES, [draw.brake for draw in draws], records, pool)
 
     low, high = np.full(len(draws), SHORTEST), np.full(len(draws), bench.timing.horizon)
-    found, middle = of_first(high), high
+    found = of_first(high)
     while (high - low > 1).any():
         middle = (low + high) // 2
         largest = [one.repeatability[: one.count].max() for one in of_first(middle)]

@@ -46,9 +46,10 @@ ROLLED = (
     Lemma("L9a", successors.change_is_bounded, "no velocity changes by more than the law's change in one sample"),
     Lemma("L9b", successors.lost_commands_are_contained, "what acts where a command was lost is among what is assumed"),
 )
+STOPPABLE = Lemma("L2a", windows.stoppable_stops, "from what stoppable allows, full braking stops within the room")
 BRAKING = (
     *BOX,
-    Lemma("L2a", windows.stoppable_stops, "from what stoppable allows, full braking stops within the room"),
+    STOPPABLE,
     Lemma("L2b", windows.window_is_kept, "a current of the window keeps the box in the envelope, or brakes fully"),
     Lemma("L3a", safety.damping_does_not_reverse, "one sample of the damped stop does not reverse the speed"),
     Lemma("L3b", safety.braking_is_enough, "damped stop and full braking slow as the weakest brake's do, or more"),
@@ -67,7 +68,7 @@ BRAKING = (
 )
 LAGGING = (
     BOX[0],
-    Lemma("L2a", windows.stoppable_stops, "from what stoppable allows, full braking stops within the room"),
+    STOPPABLE,
     Lemma("L10a", extensions.flowing_is_bounded, "no current flows beyond what the law assumes"),
     Lemma("L10b", extensions.lagging_window_is_kept, "what the window asks of speed and e holds after the sample"),
     Lemma("L11a", extensions.motors_between_stop_too, "the motors in between stop where the two extreme ones do"),

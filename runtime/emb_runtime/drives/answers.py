@@ -109,12 +109,13 @@ class Answers:
 
     def _conditions_frames(self, now_ns: int) -> list[Frame]:
         """The frame of the conditions, once both have come of late, and if their signals carry them."""
-        message = self._layout.optional["EMB_Conditions"]
-        signals = message.signal("Temperature"), message.signal("SupplyVoltage")
         late = {name: value for name, (value, at) in self.conditions.items() if now_ns - at <= OLDEST_CONDITION_NS}
         temperature, voltage = (late.get(name, math.nan) for name in ("temperature", "supply_voltage"))
-        if not all(s.minimum <= v <= s.maximum for s, v in zip(signals, (temperature, voltage), strict=True)):
-            return []  # this way round, NaN is none
+        counter = (self._conditions_counter + 1) % COUNTER_MODULUS
+        try:
+            frame = self._layout.encode_conditions(counter, temperature, voltage)
+        except FrameError:  # NaN too: it has not come
+            return []
         self.conditions.clear()
-        self._conditions_counter = (self._conditions_counter + 1) % COUNTER_MODULUS
-        return [self._layout.encode_conditions(self._conditions_counter, temperature, voltage)]
+        self._conditions_counter = counter
+        return [frame]
