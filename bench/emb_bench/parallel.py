@@ -14,6 +14,7 @@ import shutil
 import signal
 import socket
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
@@ -144,15 +145,26 @@ def processors() -> int:
 def processes() -> Iterator[Executor]:
     """Processes for many small pieces of work, as many as processors: deaf to Ctrl-C, ended with the context.
 
-    Each of them has one thread for each library.
+    Each of them has one thread for each library, and ends if this process is killed.
     """
-    pool = ProcessPoolExecutor(processors(), mp_context=_SPAWN)
+    pool = ProcessPoolExecutor(processors(), mp_context=_SPAWN, initializer=_end_with_parent)
     try:
         with _environment(), _deaf():
             pool.submit(os.getpid).result()  # which begins all of them
         yield pool
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """Let a process of a pool end with its parent: the pool's pipes do not, as its other processes hold them open."""
+
+    def wait() -> None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
+
+    if (parent := multiprocessing.parent_process()) is not None:
+        threading.Thread(target=wait, daemon=True).start()
 
 
 @contextmanager

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import signal
 import subprocess
+import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -130,6 +131,27 @@ def test_ctrl_c_ends_every_process_leaves_no_half_result_and_exits_with_130(fold
     assert "Traceback" not in err
     assert [path.name for path in results.iterdir()] == ["r.parquet"]
     assert result.read_text() == "the last one"
+    assert left_of(running.pid) == {}
+
+
+POOL = """
+import os, time
+from emb_bench.parallel import processes
+if __name__ == "__main__":
+    with processes() as pool:
+        print("at work", flush=True)
+        list(pool.map(time.sleep, [1, 1, 1000]))
+"""
+
+
+def test_a_killed_command_leaves_no_process_of_a_pool(tmp_path: Path) -> None:
+    (tmp_path / "pool.py").write_text(POOL)
+    running = started([sys.executable, str(tmp_path / "pool.py")])
+    assert running.stdout is not None
+    assert running.stdout.readline() == "at work\n"
+    assert sum("spawn_main" in name for name in processes(running.pid).values()) >= 1
+    running.kill()
+    running.communicate(timeout=WAIT)
     assert left_of(running.pid) == {}
 
 
