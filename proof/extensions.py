@@ -8,12 +8,12 @@ from typing import Any
 
 from emb_runtime.safety.shield import (
     PAST,
+    _accelerated,
     _coasting_window,
     _flowing,
     _highest_current,
     _lagging_current,
     _lagging_window,
-    _moved_by,
     _unseen,
     damped_current,
     successor,
@@ -273,19 +273,19 @@ def _observed(
     law = law._replace(delay=law.delay._replace(observer=case.law.delay.observer))
     x = facts.real("angle", case.bottom, case.top)
     xl, xh = x - law.angle_noise, x + law.angle_noise
-    run = facts.lift(_unseen, math=math, min=facts.smaller, max=facts.greater, _moved_by=asked)
+    run = facts.lift(_unseen, math=math, _accelerated=asked)
     vl, vh = shown - law.velocity_noise, shown + law.velocity_noise
-    return law, run(law, xl, xh, vl, vh, own, age, True), xl, xh
+    return law, run(law, xl, xh, vl, vh, own, age)[:2], xl, xh
 
 
 def _accelerates(facts: Facts, case: Case, end: int, age: int, i: int) -> None:
     """Acceleration within the i-th period before the measurement, upwards (0) or downwards (1)."""
-    plain = facts.lift(_moved_by)
-    bounds: list[Real] = []
+    plain = facts.lift(_accelerated)
+    bounds: list[tuple[Real, ...]] = []
 
-    def watched(*args: Any) -> Any:
-        """The bounds come in pairs; only one is examined, the others take no paths."""
-        bounds.append(plain(*args) if len(bounds) == 2 * i + end else facts.constant(0.0))
+    def watched(*args: Any) -> tuple[Real, ...]:
+        """Only the bounds of one period are examined, the others take no paths."""
+        bounds.append(plain(*args) if len(bounds) == i else (facts.constant(0.0),) * 4)
         return bounds[-1]
 
     own = tuple(facts.real("own", -case.law.current, case.law.current) for _ in range(PAST))
@@ -305,7 +305,8 @@ def _accelerates(facts: Facts, case: Case, end: int, age: int, i: int) -> None:
     elif v < 0.0:
         facts.at_least(-law.box.friction_low, friction)
     a = motor * current - spring * facts.greater(x, 0.0) - friction - viscous * v
-    facts.claim("acceleration", bounds[2 * i + end], -a if end else a)
+    down, up, _, _ = bounds[i]
+    facts.claim("acceleration", down if end else up, -a if end else a)
 
 
 def _total(case: Case, periods: int) -> float:
@@ -315,16 +316,21 @@ def _total(case: Case, periods: int) -> float:
 
 
 def _sums_up(facts: Facts, case: Case, end: int, age: int) -> None:
-    asked: list[tuple[Real, ...]] = []
-    any_bound = facts.stand_in(-1e6, asked)
+    bounds: list[Term] = []
+
+    def any_bound(*_: Any) -> tuple[Term, ...]:
+        """Any number at the end that is examined."""
+        bounds.append(facts.real("any", -1e6))
+        nothing = facts.constant(0.0)
+        return (bounds[-1], nothing, nothing, nothing) if end else (nothing, bounds[-1], nothing, nothing)
+
     own = tuple(facts.real("own", -case.law.current, case.law.current) for _ in range(PAST))
     law, changes, _, _ = _observed(facts, case, age, any_bound, own, facts.real("shown", -1e4, 1e4))
     rest = _total(case, PAST - age) * law.change
     total = facts.real("rest", -rest, rest)
     for i in range(PAST - age):
-        bound = asked[2 * i + end][0]
-        facts.at_least(case.law.change / case.law.sample_time, bound)
-        a = facts.real("a", None, bound)
+        facts.at_least(case.law.change / case.law.sample_time, bounds[i])
+        a = facts.real("a", None, bounds[i])
         share = law.sample_time * (_total(case, i) - _total(case, i + 1))
         total += facts.real("share", 0.0, share) * a
     facts.claim("change", (-changes[0] if end else changes[1]) + 1e-9, total)

@@ -199,9 +199,9 @@ def lost_commands_are_contained(case: Case) -> Answer:
             return xl, xh, xl, xh
 
         own = facts.real("own", -law.current, law.current)
-        roll = facts.lift(_rolled, _moved=watched, _unseen=lambda *_: (0.0, 0.0))  # an observer widens the box
-        roll(law, facts.real("angle"), measured, (own, 0.0, 0.0, 0.0, 0.0), 1, True)
-        ((least, most),) = seen
+        roll = facts.lift(_rolled, _moved=watched, _unseen=lambda *_: (0.0,) * 4)  # an observer widens the box
+        roll(law, facts.real("angle"), measured, (own, 0.0, 0.0, 0.0, 0.0), 1)
+        (least, most), _ = seen
         room = law.velocity_noise + law.change
         v = facts.real("v", measured - room, measured + room)
         stop = -law.current * v / law.damping_velocity

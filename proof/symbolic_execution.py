@@ -1,14 +1,18 @@
 """The very functions that run, on other numbers than floats.
 
-A lifted function is the same code object; in its globals ``math`` is a version that knows the other numbers, functions
-of ours are lifted as well, and what is replaced by name is replaced. A comparison of such numbers asks the path that is
-being walked which way to go; :func:`walk` repeats the call until every way has been gone.
+A lifted function is compiled from the same source; in its globals ``math`` is a version that knows the other numbers,
+functions of ours are lifted as well, and what is replaced by name is replaced. A comparison of such numbers asks the
+path that is being walked which way to go; :func:`walk` repeats the call until every way has been gone. What only
+selects one of two numbers by their order need not fork: ``b if b < a else a`` is lifted as ``min(a, b)``.
 """
 
 from __future__ import annotations
 
+import ast
+import inspect
 from collections.abc import Callable, Iterator, Mapping
-from types import FunctionType
+from functools import cache
+from types import CodeType, FunctionType
 from typing import Any, TypeVar
 
 PACKAGES = ("emb_runtime", "emb_bench")
@@ -90,7 +94,7 @@ def _lift(fn: Any, scope: Mapping[str, Any], done: dict[Any, Any]) -> Any:
     if fn in done:
         return done[fn]
     inside = dict(fn.__globals__)
-    lifted = FunctionType(fn.__code__, inside, fn.__name__, fn.__defaults__)
+    lifted = FunctionType(_code(fn), inside, fn.__name__, fn.__defaults__)
     done[fn] = lifted
     for name in fn.__code__.co_names:
         value = inside.get(name)
@@ -98,3 +102,32 @@ def _lift(fn: Any, scope: Mapping[str, Any], done: dict[Any, Any]) -> Any:
             inside[name] = _lift(value, scope, done)
     inside.update(scope)
     return lifted
+
+
+@cache
+def _code(fn: FunctionType) -> CodeType:
+    """Code of a function in which each selection is a call."""
+    tree = _Selections().visit(ast.parse(inspect.getsource(fn)))
+    module = compile(ast.fix_missing_locations(tree), fn.__code__.co_filename, "exec")
+    return next(part for part in module.co_consts if isinstance(part, CodeType) and part.co_name == fn.__name__)
+
+
+class _Selections(ast.NodeTransformer):
+    """Makes each conditional expression that selects the lesser or the greater of two numbers ``min`` or ``max``."""
+
+    def visit_IfExp(self, node: ast.IfExp) -> ast.expr:
+        self.generic_visit(node)
+        name = selection(node)
+        return ast.Call(ast.Name(name, ast.Load()), [node.orelse, node.body], []) if name else node
+
+
+def selection(node: ast.IfExp) -> str:
+    """``min`` or ``max`` if a conditional expression gives one of the two numbers that it compares; else empty."""
+    test = node.test
+    if not isinstance(test, ast.Compare) or not isinstance(test.ops[0], ast.Lt | ast.LtE | ast.Gt | ast.GtE):
+        return ""
+    compared = [ast.unparse(part) for part in (test.left, *test.comparators)]
+    chosen = [ast.unparse(part) for part in (node.body, node.orelse)]
+    if sorted(compared) != sorted(chosen):
+        return ""
+    return "min" if isinstance(test.ops[0], ast.Lt | ast.LtE) == (chosen == compared) else "max"

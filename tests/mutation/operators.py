@@ -1,7 +1,8 @@
 """What is changed in a module to see whether its tests notice: one place of its syntax tree at a time.
 
 Left out, because no behaviour of the code hangs on it: docstrings, annotations, imports, __all__, decorators, the
-texts of messages. Strings are left out as well: a wrong key raises by itself.
+texts of messages. Strings are left out as well: a wrong key raises by itself. So is the boundary of
+``b if b < a else a``, where both are the same number.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ import copy
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypeVar
+
+from proof.symbolic_execution import selection
 
 _Node = TypeVar("_Node", bound=ast.AST)
 _Statement = ast.stmt | ast.ExceptHandler | ast.keyword
@@ -183,7 +186,7 @@ def _of_expression(node: ast.expr, parent: ast.AST) -> Iterator[tuple[str, ast.e
             rest = node.values[:index] + node.values[index + 1 :]
             yield "operand", _with(node, values=rest) if len(rest) > 1 else rest[0]
     elif isinstance(node, ast.Compare):
-        yield from _other_comparisons(node)
+        yield from _other_comparisons(node, parent)
     elif isinstance(node, ast.BinOp):
         yield "arithmetic", _with(node, op=_BINARY[type(node.op)]())
     elif isinstance(node, ast.UnaryOp) and not isinstance(node.op, ast.Not):
@@ -213,7 +216,9 @@ def _other_constants(node: ast.Constant) -> Iterator[tuple[str, ast.expr]]:
         yield "constant", ast.Constant(value * 0.9 if value else -1.0)
 
 
-def _other_comparisons(node: ast.Compare) -> Iterator[tuple[str, ast.expr]]:
+def _other_comparisons(node: ast.Compare, parent: ast.AST) -> Iterator[tuple[str, ast.expr]]:
+    if isinstance(parent, ast.IfExp) and selection(parent):
+        return
     for index, operator in enumerate(node.ops):
         if type(operator) in _BOUNDARY:
             ops = list(node.ops)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
 import json
+import linecache
 import math
+import struct
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
+from random import Random
 from types import ModuleType
 from typing import Any
 
@@ -31,6 +35,7 @@ from proof.exhaustive import damped_way, interval_law
 from proof.intervals import Boxes, Interval
 from proof.lemmas import BRAKING, judge, lemmas
 from proof.safety import Thrown
+from proof.symbolic_execution import lift, selection
 from proof.terms import Facts, lifted_law, prove
 from tests.benches import SENSOR_BENCH
 from tests.laws import with_numbers
@@ -162,17 +167,17 @@ def test_a_brake_outside_the_laws_set_is_refused() -> None:
 
 
 BROKEN_FUNCTIONS = [
-    ("L1b", "drives", "box.spring_low * max(xl", "box.spring_high * max(xl"),
-    ("L1b", "drives", "min(box.motor_high * u_low, box.motor_low * u_low)", "box.motor_low * u_low"),
+    ("L1b", "drives", "spring_low * (", "spring_high * ("),
+    ("L1b", "drives", "(weak if weak < strong else strong)", "weak"),
     ("L1c", "fastest_next", "drive + box.friction_high -", "drive - box.friction_high -"),
     ("L1c", "fastest_next", "if vl <= 0.0:", "if vl <= -1e6:"),
-    ("L1c", "_moved", "max(vh, high)", "high"),
-    ("L1d", "fastest_next", ", 0.0)", ", -1e6)"),
-    ("L1e", "_moved", "min(vl, low)", "low"),
+    ("L1c", "_moved", "high if high > vh else vh", "high"),
+    ("L1d", "fastest_next", "0.0 if fastest < 0.0 else fastest", "fastest"),
+    ("L1e", "_moved", "low if low < vl else vl", "low"),
     ("L2a", "stoppable", "9.0 * half * half", "10.0 * half * half"),
     ("L2a", "stoppable", "rest = room - ts * v", "rest = room"),
     ("L2b", "_highest_current", "box.motor_high if drive > 0.0 else box.motor_low", "box.motor_low"),
-    ("L2b", "_highest_current", "min(drive, v / ts - box.friction_high)", "drive"),
+    ("L2b", "_highest_current", "jumping if jumping < drive else drive", "drive"),
     ("L2b", "_braking_window", "- VELOCITY_PAD\n    bottom", "\n    bottom"),
     ("L2b", "_braking_window", "law.top - xh", "law.top - xl"),
     ("L3b", "damped_current", "-limit * velocity", "-0.99 * limit * velocity"),
@@ -189,14 +194,14 @@ BROKEN_FUNCTIONS = [
     (
         "L13",
         "_unseen",
-        "slow, fast = slow - law.change, fast + law.change",
-        "slow, fast = vl - law.change, vh + law.change",
+        "slow, fast = slow - change, fast + change",
+        "slow, fast = vl - change, vh + change",
     ),
-    ("L13", "_unseen", "min(u_low, damped_current", "max(u_low, damped_current"),
-    ("L13", "_unseen", "* ts * max(_moved_by(law, slow", "* 0.99 * ts * max(_moved_by(law, slow"),
-    ("L13", "_unseen", "risen = -blind, blind", "risen = -blind, 0.9 * blind"),
-    ("L13", "_unseen", "xl - i * law.reach", "xl + law.reach"),
-    ("L13", "_moved_by", "- box.friction_low", "- box.friction_high"),
+    ("L13", "_unseen", "risen += share", "risen += 0.99 * share"),
+    ("L13", "_unseen", "risen = rose = blind", "risen = rose = 0.9 * blind"),
+    ("L13", "_unseen", "xl - i * reach", "xl + reach"),
+    ("L13", "_accelerated", "u if u < own else own", "u if u > own else own"),
+    ("L13", "_accelerated", "obeyed_up = up - friction_low", "obeyed_up = up - friction_high"),
     ("L5b", "reserve", "v + limit if v >= limit else v + v", "limit if v >= limit else v"),
 ]
 
@@ -226,7 +231,9 @@ def replace_in(monkeypatch: pytest.MonkeyPatch, name: str, old: str, new: str) -
     source = inspect.getsource(function)
     assert source.count(old) == 1
     found: dict[str, Any] = {}
-    exec(compile("from __future__ import annotations\n" + source.replace(old, new), name, "exec"), vars(module), found)
+    text = "from __future__ import annotations\n" + source.replace(old, new)
+    monkeypatch.setitem(linecache.cache, name, (len(text), None, text.splitlines(keepends=True), name))
+    exec(compile(text, name, "exec"), vars(module), found)
     for m in MODULES:
         if hasattr(m, name):
             monkeypatch.setattr(m, name, found[name])
@@ -332,6 +339,60 @@ def test_the_solver_goes_every_way_that_is_open_and_no_other() -> None:
 
     assert prove(statement).proved
     assert sorted(ways) == ["ace", "acf", "bce", "bcf", "bde", "bdf"]
+
+
+SELECTIONS = {
+    "b if b < a else a": "min",
+    "b if b > a else a": "max",
+    "a if b >= a else b": "min",
+    "a.x if 0.0 <= a.x else 0.0": "max",
+    "a if a < b else c": "",
+    "a if a < b < c else b": "",
+    "a if a == b else b": "",
+    "a if a else b": "",
+}
+
+
+def test_a_conditional_expression_that_gives_one_of_what_it_compares_is_a_selection() -> None:
+    found = {text: selection(ast.parse(text, mode="eval").body) for text in SELECTIONS}  # type: ignore[arg-type]
+    assert found == SELECTIONS
+
+
+SPECIAL = (0.0, -0.0, math.nan, math.inf, -math.inf, 5e-324, -5e-324, 1e-310, 1.0, -6.0, 1e300)
+WITH_SELECTIONS = {
+    "drives": 4,
+    "fastest_next": 3,
+    "successor": 5,
+    "_accelerated": 5,
+    "_braking_window": 4,
+    "_arrival": 2,
+    "shield": 8,
+}
+"""Functions of the shield, and how many numbers each takes beside the law."""
+
+
+def bits(fn: Callable[..., Any], law: Any, values: list[float]) -> object:
+    """What a function gives, to the last bit, one NaN being like another; the class of what it raises."""
+    numbers = values if len(values) < 8 else [*values[:3], tuple(values[3:]), 100]
+    try:
+        found = fn(law, *numbers)
+    except (ArithmeticError, ValueError) as err:
+        return type(err)
+    found = found if isinstance(found, tuple) else (found,)
+    return [struct.pack("<d", math.nan if math.isnan(number) else number) for number in found]
+
+
+def test_a_selection_is_what_min_and_max_give_to_the_last_bit_whatever_the_numbers() -> None:
+    dice = Random(11)
+    for name, count in WITH_SELECTIONS.items():
+        plain = getattr(shield_module, name)
+        lifted = lift(plain, {})  # with min and max themselves
+        for case in (SHIPPED, OBSERVED):
+            for _ in range(1000):
+                values = [
+                    dice.choice((dice.uniform(-500.0, 500.0), *SPECIAL[: dice.randrange(12)])) for _ in range(count)
+                ]
+                assert bits(lifted, case.law, values) == bits(plain, case.law, values), (name, values)
 
 
 def test_the_solver_finds_the_one_point_that_breaks_a_statement() -> None:

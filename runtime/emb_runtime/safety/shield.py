@@ -19,6 +19,8 @@ The argument, in short (in full, with what it does not cover, in ``docs/explanat
 * By the worst brake's arrival time the shield takes over to be home at the end of the experiment.
 
 All accelerations are torques over the inertia [rad/s²]; a name that ends in ``_low``/``_high`` is a bound of the box.
+What a cycle computes with floats writes ``b if b < a else a`` for ``min(a, b)``, and likewise for ``max``: it is what
+these give, zeros and NaN included, in a third of their time.
 """
 
 from __future__ import annotations
@@ -40,6 +42,8 @@ PAST: Final = 5  # Own commands that :func:`shield` may want to know
 Past = tuple[float, float, float, float, float]
 """The last own commands, newest first [A]; 0 where nothing was sent. A law for fresh frames does not look at them."""
 NO_PAST: Past = (0.0, 0.0, 0.0, 0.0, 0.0)
+States = tuple[float, float, float, float]
+"""A box of states: least and greatest angle [rad], least and greatest velocity [rad/s]."""
 
 
 def shield(law: ShieldLaw, angle: float, velocity: float, wanted: float, past: Past, step: int) -> tuple[float, int]:
@@ -63,11 +67,12 @@ def shield(law: ShieldLaw, angle: float, velocity: float, wanted: float, past: P
     """
     if not _believable(law, angle, velocity, past):
         return _blind_current(law, velocity), LIMITED
-    lowest, highest = _window(law, angle, velocity, past)
-    sent = min(max(wanted, lowest), highest) if math.isfinite(wanted) else min(max(0.0, lowest), highest)
+    lowest, highest, xl, xh, vl, vh = _window_and_box(law, angle, velocity, past)
+    sent = wanted if math.isfinite(wanted) else 0.0
+    sent = lowest if lowest > sent else sent
+    sent = highest if highest < sent else sent
     bits = 0 if sent == wanted else LIMITED
     left = (law.steps - 1 - step) * law.sample_time
-    xl, xh, vl, vh = _now(law, angle, velocity, past)
     if _must_return(law, xl, xh, vl, vh, sent, left):
         sent = _return_current(law, 0.5 * (xl + xh), 0.5 * (vl + vh), left)
         sent = min(max(sent, lowest), highest)
@@ -84,36 +89,63 @@ def window(law: ShieldLaw, angle: float, velocity: float, past: Past) -> tuple[f
     if not _believable(law, angle, velocity, past):
         blind = _blind_current(law, velocity)
         return blind, blind
-    return _window(law, angle, velocity, past)
+    found = _window_and_box(law, angle, velocity, past)
+    return found[0], found[1]
 
 
-def _window(law: ShieldLaw, angle: float, velocity: float, past: Past) -> tuple[float, float]:
-    lowest = -law.current
-    highest = law.current
+def _window_and_box(
+    law: ShieldLaw, angle: float, velocity: float, past: Past
+) -> tuple[float, float, float, float, float, float]:
+    """The :func:`window`, and the box of states at the begin of this period if every command was obeyed.
+
+    The box is the hull over all ages of a frame. Where the current lags, its velocities are those after what flows has
+    decayed.
+    """
+    lowest, highest = -law.current, law.current
+    x0 = x1 = v0 = v1 = 0.0
     for age in range(law.age_low, law.age_high + 1):
-        xl, xh, vl, vh = _rolled(law, angle, velocity, past, age, True)
+        (xl, xh, vl, vh), obeyed = _rolled(law, angle, velocity, past, age)
         if law.coasting:
             bottom, top = _coasting_window(law, xl, xh, vl, vh)
         elif law.delay.lag > 0.0:
             bottom, top = _lagging_window(law, xl, xh, vl, vh, past)
         else:
             bottom, top = _braking_window(law, xl, xh, vl, vh)
-        highest = min(highest, top)
-        lowest = max(lowest, bottom)
+        highest = top if top < highest else highest
+        lowest = bottom if bottom > lowest else lowest
+        xl, xh, vl, vh = obeyed
+        if age > law.age_low:
+            xl, xh, vl, vh = min(x0, xl), max(x1, xh), min(v0, vl), max(v1, vh)
+        x0, x1, v0, v1 = xl, xh, vl, vh
     if lowest > highest:  # cannot happen to a brake of the set; whatever this is, full braking is right for it
         lowest = highest = -law.current if velocity > 0.0 else law.current
-    return lowest, highest
+    if law.delay.lag > 0.0:
+        v0, v1 = _decayed(law, v0, v1, past)
+    return lowest, highest, x0, x1, v0, v1
+
+
+def _decayed(law: ShieldLaw, vl: float, vh: float, past: Past) -> tuple[float, float]:
+    """Least and greatest velocity after what flows in a motor whose current lags has decayed."""
+    box, delay, flowing = law.box, law.delay, 0.0
+    for i in range(PAST - 1, -1, -1):
+        flowing = past[i] + delay.kept * (flowing - past[i])
+    vl += delay.lag * (box.motor_low if flowing > 0.0 else box.motor_high) * flowing
+    vh += delay.lag * (box.motor_high if flowing > 0.0 else box.motor_low) * flowing
+    return vl, vh
 
 
 def _braking_window(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float) -> tuple[float, float]:
     """The window for a box of states, each end cut at full braking (L2-L4 in ``docs/explanation/shield.md``)."""
-    ts, box = law.sample_time, law.box
-    braking = box.braking + box.spring_low * max(xl, 0.0)
-    v = min(law.outward_speed, stoppable(law.top - xh, vh, braking, ts)) - VELOCITY_PAD
-    top = _highest_current(law, vl, vh, v, box.spring_low * max(xl - law.reach, 0.0))
-    v = min(law.homeward_speed, stoppable(xl - law.bottom, -vl, box.braking, ts)) - VELOCITY_PAD
-    bottom = -_highest_current(law, -vh, -vl, v, -box.spring_high * max(xh + law.reach, 0.0))
-    return min(bottom, law.current), max(top, -law.current)
+    ts, box, limit, spring = law.sample_time, law.box, law.current, law.box.spring_low
+    nearest, farthest = xl - law.reach, xh + law.reach
+    braking = box.braking + spring * (0.0 if xl < 0.0 else xl)
+    fastest, v = law.outward_speed, stoppable(law.top - xh, vh, braking, ts)
+    v = (v if v < fastest else fastest) - VELOCITY_PAD
+    top = _highest_current(law, vl, vh, v, spring * (0.0 if nearest < 0.0 else nearest))
+    fastest, v = law.homeward_speed, stoppable(xl - law.bottom, -vl, box.braking, ts)
+    v = (v if v < fastest else fastest) - VELOCITY_PAD
+    bottom = -_highest_current(law, -vh, -vl, v, -box.spring_high * (0.0 if farthest < 0.0 else farthest))
+    return limit if limit < bottom else bottom, -limit if -limit > top else top
 
 
 def _coasting_window(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float) -> tuple[float, float]:
@@ -219,63 +251,105 @@ def _believable(law: ShieldLaw, angle: float, velocity: float, past: Past) -> bo
     return abs(velocity) <= BELIEVABLE and total <= BELIEVABLE
 
 
-def _rolled(
-    law: ShieldLaw, angle: float, velocity: float, past: Past, age: int, lost: bool
-) -> tuple[float, float, float, float]:
-    """The box of states at the begin of this period, after a measurement of that age.
+def _rolled(law: ShieldLaw, angle: float, velocity: float, past: Past, age: int) -> tuple[States, States]:
+    """Boxes of states at the begin of this period, after a measurement of that age.
 
-    ``lost``: each of the commands since may have been lost, so that the node has braked.
+    In the first each of the commands since may have been lost, so that the node has braked; in the second none was.
     """
     xl = angle - law.angle_noise
     xh = angle + law.angle_noise
     vl = velocity - law.velocity_noise
     vh = velocity + law.velocity_noise
+    lost = obeyed = xl, xh, vl, vh
     if law.delay.observer > 0.0:
-        fallen, risen = _unseen(law, xl, xh, vl, vh, past, age, lost)
-        vl, vh = vl + fallen, vh + risen
+        fallen, risen, fell, rose = _unseen(law, xl, xh, vl, vh, past, age)
+        lost, obeyed = (xl, xh, vl + fallen, vh + risen), (xl, xh, vl + fell, vh + rose)
     for i in range(age, 0, -1):
-        u_low = u_high = past[i - 1]
-        if lost:
-            u_low = min(u_low, damped_current(vh + law.change, law.current, law.damping_velocity))
-            u_high = max(u_high, damped_current(vl - law.change, law.current, law.damping_velocity))
-        xl, xh, vl, vh = _moved(law, xl, xh, vl, vh, u_low, u_high)
-    return xl, xh, vl, vh
+        u = past[i - 1]
+        xl, xh, vl, vh = lost
+        u_low = min(u, damped_current(vh + law.change, law.current, law.damping_velocity))
+        u_high = max(u, damped_current(vl - law.change, law.current, law.damping_velocity))
+        lost = _moved(law, xl, xh, vl, vh, u_low, u_high)
+        xl, xh, vl, vh = obeyed
+        obeyed = _moved(law, xl, xh, vl, vh, u, u)
+    return lost, obeyed
 
 
 def _unseen(
-    law: ShieldLaw, xl: float, xh: float, vl: float, vh: float, past: Past, age: int, lost: bool
-) -> tuple[float, float]:
+    law: ShieldLaw, xl: float, xh: float, vl: float, vh: float, past: Past, age: int
+) -> tuple[float, float, float, float]:
     """Least and greatest change of the velocity that an observer does not show yet, by a measurement of that age.
 
     The share (1 + ωτ) exp(−ωτ) of what the acceleration has changed until the time τ before, at most; less what an
-    observer overshoots by. ``lost`` as for :func:`_rolled`.
+    observer overshoots by. Twice, as of :func:`_rolled`: where commands may have been lost, and where none was.
     """
-    ts, scaled = law.sample_time, law.delay.observer
-    blind = unseen(scaled, PAST - age) * law.change
-    aside = blind + (2.0 / scaled) * law.change
-    slow, fast = vl - aside, vh + aside
-    fallen, risen = -blind, blind
+    ts, scaled, change, reach = law.sample_time, law.delay.observer, law.change, law.reach
+    blind = unseen(scaled, PAST - age) * change
     left = 2.0 / scaled
+    aside = blind + left * change
+    slow, fast = vl - aside, vh + aside
+    fallen = fell = -blind
+    risen = rose = blind
     for i in range(PAST - age):
-        u_low = u_high = past[age + i]
-        slow, fast = slow - law.change, fast + law.change
-        if lost:
-            u_low = min(u_low, damped_current(fast, law.current, law.damping_velocity))
-            u_high = max(u_high, damped_current(slow, law.current, law.damping_velocity))
-        low, high = drives(law, xl - i * law.reach, xh + i * law.reach, u_low, u_high)
+        slow, fast = slow - change, fast + change
+        down, up, obeyed_down, obeyed_up = _accelerated(law, xl - i * reach, xh + i * reach, slow, fast, past[age + i])
         before = left
         left = (2.0 / scaled + i + 1) * math.exp(-scaled * (i + 1))
-        risen += (before - left) * ts * max(_moved_by(law, slow, high), 0.0)
-        fallen -= (before - left) * ts * max(_moved_by(law, -fast, -low), 0.0)
-    return fallen, risen
+        share = (before - left) * ts
+        fallen -= share * (0.0 if down < 0.0 else down)
+        risen += share * (0.0 if up < 0.0 else up)
+        fell -= share * (0.0 if obeyed_down < 0.0 else obeyed_down)
+        rose += share * (0.0 if obeyed_up < 0.0 else obeyed_up)
+    return fallen, risen, fell, rose
 
 
-def _moved_by(law: ShieldLaw, slowest: float, drive: float) -> float:
-    """Greatest acceleration from ``slowest`` or above, where ``drive`` bounds motor and spring [rad/s²]."""
-    box = law.box
-    if slowest > 0.0:
-        return drive - box.friction_low - box.viscous_low * slowest
-    return drive + box.friction_high - box.viscous_high * slowest
+def _accelerated(
+    law: ShieldLaw, xl: float, xh: float, slow: float, fast: float, own: float
+) -> tuple[float, float, float, float]:
+    """Greatest accelerations of any brake of the set in a period, downwards and upwards [rad/s²].
+
+    First where the command may have been lost, so that the node has braked; then where it was obeyed.
+
+    Args:
+        law: of the bench.
+        xl: least angle at the begin of the period [rad].
+        xh: greatest angle there [rad].
+        slow: least velocity within the period [rad/s].
+        fast: greatest velocity within it [rad/s].
+        own: command of the period [A].
+    """
+    motor_low, motor_high, spring_low, spring_high, friction_low, friction_high, viscous_low, viscous_high, _, _ = (
+        law.box
+    )
+    limit, damping = law.current, law.damping_velocity
+    nearest, farthest = xl - law.reach, xh + law.reach
+    soft = spring_low * (0.0 if nearest < 0.0 else nearest)
+    stiff = spring_high * (0.0 if farthest < 0.0 else farthest)
+    strong, weak = motor_high * own, motor_low * own
+    obeyed_up = (weak if weak > strong else strong) - soft
+    obeyed_down = stiff - (weak if weak < strong else strong)
+    u = damped_current(slow, limit, damping)
+    u = u if u > own else own
+    strong, weak = motor_high * u, motor_low * u
+    up = (weak if weak > strong else strong) - soft
+    u = damped_current(fast, limit, damping)
+    u = u if u < own else own
+    strong, weak = motor_high * u, motor_low * u
+    down = stiff - (weak if weak < strong else strong)
+    # Friction takes the more, the faster the brake; where it moves the other way, it helps.
+    if slow > 0.0:
+        taken = viscous_low * slow
+        up, obeyed_up = up - friction_low - taken, obeyed_up - friction_low - taken
+    else:
+        taken = viscous_high * slow
+        up, obeyed_up = up + friction_high - taken, obeyed_up + friction_high - taken
+    if fast < 0.0:
+        taken = viscous_low * fast
+        down, obeyed_down = down - friction_low + taken, obeyed_down - friction_low + taken
+    else:
+        taken = viscous_high * fast
+        down, obeyed_down = down + friction_high + taken, obeyed_down + friction_high + taken
+    return down, up, obeyed_down, obeyed_up
 
 
 def damped_current(velocity: float, limit: float, damping_velocity: float) -> float:
@@ -283,26 +357,9 @@ def damped_current(velocity: float, limit: float, damping_velocity: float) -> fl
 
     It is the limit from ``damping_velocity`` on, which is infinite for a node that only lets go [rad/s].
     """
-    return min(max(-limit * velocity / damping_velocity, -limit), limit)
-
-
-def _now(law: ShieldLaw, angle: float, velocity: float, past: Past) -> tuple[float, float, float, float]:
-    """State box at the start of this period, if every command was obeyed; hull over all frame ages.
-
-    Where the current lags, the velocities are those after what flows has decayed.
-    """
-    box, delay = law.box, law.delay
-    xl, xh, vl, vh = _rolled(law, angle, velocity, past, law.age_low, False)
-    for age in range(law.age_low + 1, law.age_high + 1):
-        x0, x1, v0, v1 = _rolled(law, angle, velocity, past, age, False)
-        xl, xh, vl, vh = min(xl, x0), max(xh, x1), min(vl, v0), max(vh, v1)
-    if delay.lag > 0.0:
-        flowing = 0.0
-        for i in range(PAST - 1, -1, -1):
-            flowing = past[i] + delay.kept * (flowing - past[i])
-        vl += delay.lag * (box.motor_low if flowing > 0.0 else box.motor_high) * flowing
-        vh += delay.lag * (box.motor_high if flowing > 0.0 else box.motor_low) * flowing
-    return xl, xh, vl, vh
+    u = -limit * velocity / damping_velocity
+    u = -limit if -limit > u else u
+    return limit if limit < u else u
 
 
 def successor(
@@ -322,7 +379,8 @@ def _moved(
     drive_low, drive_high = drives(law, xl, xh, u_low, u_high)
     high = fastest_next(law, vl, vh, drive_high) + VELOCITY_PAD
     low = -fastest_next(law, -vh, -vl, -drive_low) - VELOCITY_PAD
-    return xl + law.sample_time * min(vl, low), xh + law.sample_time * max(vh, high), low, high
+    slowest, fastest = low if low < vl else vl, high if high > vh else vh
+    return xl + law.sample_time * slowest, xh + law.sample_time * fastest, low, high
 
 
 def drives(law: ShieldLaw, xl: float, xh: float, u_low: float, u_high: float) -> tuple[float, float]:
@@ -330,9 +388,12 @@ def drives(law: ShieldLaw, xl: float, xh: float, u_low: float, u_high: float) ->
 
     Its angle begins within ``xl`` and ``xh`` [rad], and its current stays within ``u_low`` and ``u_high`` [A].
     """
-    box = law.box
-    drive_high = max(box.motor_high * u_high, box.motor_low * u_high) - box.spring_low * max(xl - law.reach, 0.0)
-    drive_low = min(box.motor_high * u_low, box.motor_low * u_low) - box.spring_high * max(xh + law.reach, 0.0)
+    motor_low, motor_high, spring_low, spring_high, _, _, _, _, _, _ = law.box
+    nearest, farthest = xl - law.reach, xh + law.reach
+    strong, weak = motor_high * u_high, motor_low * u_high
+    drive_high = (weak if weak > strong else strong) - spring_low * (0.0 if nearest < 0.0 else nearest)
+    strong, weak = motor_high * u_low, motor_low * u_low
+    drive_low = (weak if weak < strong else strong) - spring_high * (0.0 if farthest < 0.0 else farthest)
     return drive_low, drive_high
 
 
@@ -345,9 +406,11 @@ def fastest_next(law: ShieldLaw, vl: float, vh: float, drive: float) -> float:
     ts, box = law.sample_time, law.box
     if vh <= 0.0:
         return vh + ts * (drive + box.friction_high - box.viscous_high * vh)
-    fastest = max(vh + ts * (drive - box.friction_low - box.viscous_low * vh), 0.0)
+    fastest = vh + ts * (drive - box.friction_low - box.viscous_low * vh)
+    fastest = 0.0 if fastest < 0.0 else fastest
     if vl <= 0.0:
-        fastest = max(fastest, ts * (drive + box.friction_high))
+        jumped = ts * (drive + box.friction_high)
+        fastest = jumped if jumped > fastest else fastest
     return fastest
 
 
@@ -364,7 +427,8 @@ def _highest_current(law: ShieldLaw, vl: float, vh: float, v: float, spring: flo
     if vh > 0.0:
         drive = (v - vh) / ts + box.friction_low + box.viscous_low * vh
         if vl <= 0.0:
-            drive = min(drive, v / ts - box.friction_high)
+            jumping = v / ts - box.friction_high
+            drive = jumping if jumping < drive else drive
     else:
         drive = (v - vh) / ts - box.friction_high + box.viscous_high * vh
     drive += spring
@@ -381,12 +445,13 @@ def _must_return(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float, cur
     if left < law.home.committed:
         return True
     xl, xh, vl, vh = successor(law, xl, xh, vl, vh, current)
-    return max(_arrival(law, xl, vl), _arrival(law, xh, vh)) + law.home.reserve > left
+    first, last = _arrival(law, xl, vl), _arrival(law, xh, vh)
+    return (last if last > first else first) + law.home.reserve > left
 
 
 def _arrival(law: ShieldLaw, x: float, v: float) -> float:
     """Time in which the worst brake of the box is at rest at the origin by the way home [s]."""
-    way = law.home
+    way, landing = law.home, law.home.landing
     out = v
     spring = law.box.spring_low * x
     if x < 0.0:
@@ -400,21 +465,22 @@ def _arrival(law: ShieldLaw, x: float, v: float) -> float:
         t = out / braking
         x += 0.5 * out * (t + law.sample_time)
         home = 0.0
-    beyond = 0.5 * home * home / way.landing - x
+    beyond = 0.5 * home * home / landing - x
     if beyond > 0.0:  # too fast to stop at the origin: come back from the other side
-        t += home / way.landing
+        t += home / landing
         x = beyond
         home = 0.0
         spring = 0.0
     ramp = way.ramp + 0.5 * spring
-    peak = math.sqrt((x + 0.5 * home * home / ramp) / (0.5 / ramp + 0.5 / way.landing))
-    peak = max(min(peak, way.cruise), home)
-    cruising = x - 0.5 * (peak * peak - home * home) / ramp - 0.5 * peak * peak / way.landing
+    peak = math.sqrt((x + 0.5 * home * home / ramp) / (0.5 / ramp + 0.5 / landing))
+    peak = way.cruise if way.cruise < peak else peak
+    peak = home if home > peak else peak
+    cruising = x - 0.5 * (peak * peak - home * home) / ramp - 0.5 * peak * peak / landing
     if cruising > 0.0:
         t += cruising / way.cruise
     if law.coasting:
         t += _climbing_down(law, x)
-    return t + (peak - home) / ramp + peak / way.landing
+    return t + (peak - home) / ramp + peak / landing
 
 
 def _climbing_down(law: ShieldLaw, x: float) -> float:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections.abc import Iterable
-from dataclasses import replace
 from random import Random
 from typing import Any
 
@@ -16,8 +15,8 @@ import pytest
 
 from emb_runtime.safety.command_limits import CommandLimits, decide
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
-from tests.benches import SENSOR_BENCH
 from tests.laws import numbers
+from tests.properties.shield_search import bench_with
 
 COASTING = {"envelope": "coasting", "angle_margin": 1.1}
 PINNED: dict[str, tuple[dict[str, Any], str, str]] = {
@@ -25,6 +24,8 @@ PINNED: dict[str, tuple[dict[str, Any], str, str]] = {
     "lagging": ({"current_lag": 0.002}, "2b6f7edada5bbdb7", "c17f5a1f891682a0"),
     "late": ({"frame_age": (0, 3)}, "86bb046f111720ad", "00b847c61a6e6b19"),
     "of one age": ({"frame_age": (1, 1)}, "185d1f3062e36c5a", "0c731be54ff2e987"),
+    "observed": ({"observer": 1520.0}, "49c4fcd093ae98c0", "77b72fca9686517e"),
+    "observed, late": ({"observer": 1520.0, "frame_age": (0, 1)}, "b1723592029e77f7", "8e5c56837e0fac11"),
     "coasting": (COASTING, "f454d49bd7d2eb2b", "d99565461ca7e2db"),
 }
 """Settings of the shield; digests of its law, and of its decisions."""
@@ -36,8 +37,8 @@ def digest(numbers: Iterable[float]) -> str:
 
 
 def law_of(settings: dict[str, Any]) -> ShieldLaw:
-    """Law of the shipped bench with a sensor of the velocity and other settings of the shield."""
-    return make_law(replace(SENSOR_BENCH, shield=SENSOR_BENCH.shield._replace(**settings)))
+    """Law of the shipped bench with a sensor of the velocity, or an observer, and other settings of the shield."""
+    return make_law(bench_with(**settings))
 
 
 @pytest.mark.parametrize("name", PINNED)

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_runtime.records import Reason
-from emb_runtime.safety.shield import LIMITED, NO_PAST, RETURNING, Past, _moved_by, shield, successor, window
+from emb_runtime.safety.shield import LIMITED, NO_PAST, RETURNING, Past, _accelerated, shield, successor, window
 from emb_runtime.safety.shield_design import CREEPS, VELOCITY_PAD, ShieldLaw, make_law
 from tests.benches import SENSOR_BENCH
 from tests.laws import with_numbers
@@ -325,8 +325,10 @@ def test_the_window_behind_an_observer_holds_whatever_it_does_not_show_yet(ages:
 
 def test_a_brake_at_rest_may_be_pushed_by_its_friction_the_next_moment() -> None:
     law = drawn_law(Random(13))
-    assert _moved_by(law, 0.0, 10.0) == 10.0 + law.box.friction_high
-    assert _moved_by(law, 0.5, 10.0) == 10.0 - law.box.friction_low - law.box.viscous_low * 0.5
+    for slow, gained in ((0.0, law.box.friction_high), (0.5, -law.box.friction_low - law.box.viscous_low * 0.5)):
+        _, _, _, up = _accelerated(law, -1.0, -1.0, slow, slow, 2.0)
+        _, _, down, _ = _accelerated(law, -1.0, -1.0, -slow, -slow, -2.0)
+        assert up == down == pytest.approx(2.0 * law.box.motor_high + gained, rel=1e-14)
 
 
 def drawn_past(rng: Random, law: ShieldLaw) -> Past:
