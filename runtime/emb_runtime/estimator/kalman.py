@@ -141,7 +141,8 @@ def follow(model: Model, state: State, angle: float, velocity: float, step: floa
         mean, p, other = _correct(mean, p, row, velocity - mean[1], row[1] + model.velocity_variance)
         square, samples = 0.5 * (square + other), 0.5 * MEMORY
     innovation = state.innovation + (square - state.innovation) / samples
-    return State(step, mean, p, innovation, max(state.worst, innovation))
+    worst = state.worst
+    return State(step, mean, p, innovation, innovation if innovation > worst else worst)
 
 
 def predict(model: Model, state: State, periods: float, applied: float) -> tuple[Six, Packed]:
@@ -152,79 +153,78 @@ def predict(model: Model, state: State, periods: float, applied: float) -> tuple
     mean, p = state.mean, state.covariance
     if periods <= 0.0:
         return mean, p
-    t, lost = periods * model.sample_time, max(periods - 1.0, 0.0) * model.lost
+    by_k1, by_tc, by_fv = model.spring, model.coulomb, model.viscous
+    t, gaps = periods * model.sample_time, periods - 1.0
+    lost = (0.0 if gaps < 0.0 else gaps) * model.lost
     x, v, km, k1, tc, fv = mean
-    driving, by_friction = model.motor * applied, t * model.coulomb
-    spring, damping = model.spring * k1, model.viscous * fv
-    now = Accelerations(driving * km - spring * max(x, 0.0), model.coulomb * tc, damping, spring)
+    p00, p01, _, p03, p04, _, p11, p12, p13, p14, p15, _, _, p24, _, p33, p34, _, p44, p45, p55 = p
+    driving, by_friction, pressed = model.motor * applied, t * by_tc, 0.0 if x < 0.0 else x
+    spring, damping = by_k1 * k1, by_fv * fv
+    pull = driving * km - spring * pressed
     # Variance of the velocity after sliding, by the motion and by friction, and the covariance of these two parts.
     b0, b1, b2 = -spring if x >= 0.0 else 0.0, -damping, driving
-    b3, b5 = -model.spring * max(x, 0.0), -model.viscous * v
+    b3, b5 = -by_k1 * pressed, -by_fv * v
     c0, c1, c2, c3, _, c5 = _product(p, (b0, b1, b2, b3, 0.0, b5))
-    p11, p14 = p[6], p[9]
-    sliding = p11 + by_friction * by_friction * p[18]
-    sliding += t * b0 * (2.0 * p[1] + t * c0)
+    sliding = p11 + by_friction * by_friction * p44
+    sliding += t * b0 * (2.0 * p01 + t * c0)
     sliding += t * b1 * (2.0 * p11 + t * c1)
-    sliding += t * b2 * (2.0 * p[7] + t * c2)
-    sliding += t * b3 * (2.0 * p[8] + t * c3)
-    sliding += t * b5 * (2.0 * p[10] + t * c5)
-    common = p14 + t * b0 * p[4] + t * b1 * p14 + t * b2 * p[13] + t * b3 * p[16] + t * b5 * p[19]
+    sliding += t * b2 * (2.0 * p12 + t * c2)
+    sliding += t * b3 * (2.0 * p13 + t * c3)
+    sliding += t * b5 * (2.0 * p15 + t * c5)
+    common = p14 + t * b0 * p04 + t * b1 * p14 + t * b2 * p24 + t * b3 * p34 + t * b5 * p45
     common *= by_friction
-    shared = 2.0 * common if now.pull >= 0.0 else -2.0 * common
-    ahead = move(
-        now,
+    shared = 2.0 * common if pull >= 0.0 else -2.0 * common
+    against, along = sliding + shared, sliding - shared
+    x1, v1, x_by_v, x_by_pull, x_by_tc, v_by_v, v_by_pull, v_by_tc, stopped, kinked = move(
+        Accelerations(pull, by_tc * tc, damping, spring),
         x,
         v,
         t,
-        math.sqrt(max(p11, LEAST_VARIANCE)),
-        math.sqrt(max(sliding + shared, LEAST_VARIANCE)),
-        math.sqrt(max(sliding - shared, LEAST_VARIANCE)),
+        math.sqrt(LEAST_VARIANCE if p11 < LEAST_VARIANCE else p11),
+        math.sqrt(LEAST_VARIANCE if against < LEAST_VARIANCE else against),
+        math.sqrt(LEAST_VARIANCE if along < LEAST_VARIANCE else along),
     )
-    share, to_velocity, to_angle = contact(x, ahead.angle, t, v, ahead.velocity)
-    stiff = model.spring * share
+    share, to_velocity, to_angle = contact(x, x1, t, v, v1)
+    stiff = by_k1 * share
     # Second order: the mean and the variance of the products f_v v and k_1 x.
-    drifting, softening = model.viscous * p[10], stiff * p[3]
-    doubtful = drifting * drifting + model.viscous * model.viscous * p11 * p[20]
-    doubtful += softening * softening + stiff * stiff * p[0] * p[15]
+    drifting, softening = by_fv * p15, stiff * p03
+    doubtful = drifting * drifting + by_fv * by_fv * p11 * p55
+    doubtful += softening * softening + stiff * stiff * p00 * p33
     half_square, bias = 0.5 * t * t, drifting + softening
-    unsure = 2.0 * COHERENCE * (half_square * doubtful) + ahead.kinked
+    unsure = 2.0 * COHERENCE * (half_square * doubtful) + kinked
     crossed = CONTACT_VARIANCE if 0.0 < share < 1.0 else 0.0
-    missed, touched, sums = t * lost, spring * share, v + ahead.velocity
-    by_angle, by_velocity = ahead.angle_by_pull, ahead.velocity_by_pull
-    angle_slopes = (
-        1.0 - by_angle * touched,
-        ahead.angle_by_velocity - by_angle * damping,
-        by_angle * driving,
-        by_angle * (-model.spring * to_angle),
-        ahead.angle_by_friction * model.coulomb,
-        by_angle * (-model.viscous / 3.0 * (v + sums)),
+    missed, touched, sums = t * lost, spring * share, v + v1
+    x_slopes = (
+        1.0 - x_by_pull * touched,
+        x_by_v - x_by_pull * damping,
+        x_by_pull * driving,
+        x_by_pull * (-by_k1 * to_angle),
+        x_by_tc * by_tc,
+        x_by_pull * (-by_fv / 3.0 * (v + sums)),
     )
-    velocity_slopes = (
-        -by_velocity * touched,
-        ahead.velocity_by_velocity * (1.0 - half_square * touched) - by_velocity * damping,
-        by_velocity * driving,
-        by_velocity * (-model.spring * to_velocity),
-        ahead.velocity_by_friction * model.coulomb,
-        by_velocity * (-0.5 * model.viscous * sums),
+    v_slopes = (
+        -v_by_pull * touched,
+        v_by_v * (1.0 - half_square * touched) - v_by_pull * damping,
+        v_by_pull * driving,
+        v_by_pull * (-by_k1 * to_velocity),
+        v_by_tc * by_tc,
+        v_by_pull * (-0.5 * by_fv * sums),
     )
     noise = (
-        0.5 * (half_square * unsure) + missed * missed + ahead.stopped * STOP_VARIANCE,
+        0.5 * (half_square * unsure) + missed * missed + stopped * STOP_VARIANCE,
         0.5 * t * unsure,
         unsure + lost * lost + crossed,
     )
-    end = ahead.angle - half_square * bias, ahead.velocity - t * bias, km, k1, tc, fv
-    return end, _spread(p, angle_slopes, velocity_slopes, noise)
+    end = x1 - half_square * bias, v1 - t * bias, km, k1, tc, fv
+    return end, _spread(p, x_slopes, v_slopes, noise)
 
 
 def believed(model: Model, state: State) -> Four:
     """Relative parameters, cut off at their ranges."""
-    mean, low, high = state.mean, model.low, model.high
-    return (
-        min(max(mean[2], low[0]), high[0]),
-        min(max(mean[3], low[1]), high[1]),
-        min(max(mean[4], low[2]), high[2]),
-        min(max(mean[5], low[3]), high[3]),
-    )
+    (_, _, km, k1, tc, fv), (l2, l3, l4, l5), (h2, h3, h4, h5) = state.mean, model.low, model.high
+    km, k1 = l2 if km < l2 else km, l3 if k1 < l3 else k1
+    tc, fv = l4 if tc < l4 else tc, l5 if fv < l5 else fv
+    return h2 if km > h2 else km, h3 if k1 > h3 else k1, h4 if tc > h4 else tc, h5 if fv > h5 else fv
 
 
 def fits(state: State) -> bool:
@@ -250,7 +250,8 @@ def deviations(model: Model, state: State) -> Four:
 def _deviation(variance: float, beyond: float, width: float, doubted: bool) -> float:
     if variance < 0.0:
         return math.inf
-    known = max(math.sqrt(variance), abs(beyond))
+    known, beyond = math.sqrt(variance), abs(beyond)
+    known = beyond if beyond > known else known
     return max(known, width / math.sqrt(12.0)) if doubted else known
 
 
