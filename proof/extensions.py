@@ -270,10 +270,9 @@ def _observed(
 ) -> tuple[Any, tuple[Real, Real], Real, Real]:
     """The law; least and greatest change by its :func:`_unseen`; least and greatest angle of the measurement."""
     law = lifted_law(facts, case.law)
-    law = law._replace(delay=law.delay._replace(observer=case.law.delay.observer))
     x = facts.real("angle", case.bottom, case.top)
     xl, xh = x - law.angle_noise, x + law.angle_noise
-    run = facts.lift(_unseen, math=math, _accelerated=asked)
+    run = facts.lift(_unseen, _accelerated=asked)
     vl, vh = shown - law.velocity_noise, shown + law.velocity_noise
     return law, run(law, xl, xh, vl, vh, own, age)[:2], xl, xh
 

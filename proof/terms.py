@@ -379,5 +379,6 @@ def lifted_law(facts: Facts, law: Any) -> Any:
 def with_floats(law: Any, of: Callable[[float], Any]) -> Any:
     """A law, or part of it, with something else for each float."""
     if isinstance(law, tuple):
-        return type(law)(*(with_floats(value, of) for value in law))
+        values = (with_floats(value, of) for value in law)
+        return type(law)(*values) if hasattr(law, "_fields") else tuple(values)
     return of(law) if isinstance(law, float) else law

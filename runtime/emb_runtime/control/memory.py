@@ -61,8 +61,13 @@ class RunCounters:
         """Count a valid pair, and the periods without one just before it."""
         self.pairs += 1
         self.missed += missed
-        self.angle_min, self.angle_max = min(self.angle_min, sample.angle), max(self.angle_max, sample.angle)
-        self.top_speed = max(self.top_speed, abs(sample.velocity))
+        angle, speed = sample.angle, abs(sample.velocity)
+        if angle < self.angle_min:
+            self.angle_min = angle
+        if angle > self.angle_max:
+            self.angle_max = angle
+        if speed > self.top_speed:
+            self.top_speed = speed
 
     def count_answer(self, reasons: int, current: float) -> None:
         """Count a command that was sent, by its :class:`Reason` bits and its current [A]."""
@@ -70,7 +75,8 @@ class RunCounters:
         self.clipped += bool(reasons & CLIPPED)
         self.limited += bool(reasons & LIMITED)
         self.returning += bool(reasons & RETURNING)
-        self.top_current = max(self.top_current, abs(current))
+        if abs(current) > self.top_current:
+            self.top_current = abs(current)
 
 
 class Memory:
@@ -133,14 +139,15 @@ class Memory:
         """Count the periods between two samples, and whether the node obeyed."""
         elapsed_ns = sample.device_time_ns - before.device_time_ns
         periods = round(elapsed_ns / self.period_ns)
-        self.missed = max(0, periods - 1)
+        self.missed = periods - 1 if periods > 1 else 0
         # What the counter has skipped within the device time was sampled, and did not come.
         steps = (sample.counter - before.counter) % COUNTER_MODULUS
-        skipped = max(0, steps - periods) if periods < COUNTER_MODULUS else 0
+        skipped = steps - periods if steps > periods else 0
         self.skipped += skipped
         self.counters.count_pair(sample, self.missed + skipped)
         self.lost.forgive()
-        self.lost.reject(self.missed + skipped)
+        if self.missed + skipped:
+            self.lost.reject(self.missed + skipped)
         command, obeyed = 0.0, False
         if self._answered:
             command, obeyed = self._command.current, sample.command_counter == self._command.counter

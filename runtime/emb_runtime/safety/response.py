@@ -372,7 +372,7 @@ class Response:
         self.law = self._slow
 
     def _keep(self, kept: deque[Row] | list[Row], sample: SensorSample, follows: bool, command: float) -> None:
-        kept.append(Row(follows, sample.angle, sample.velocity, command))
+        kept.append(tuple.__new__(Row, (follows, sample.angle, sample.velocity, command)))
         self._counter = sample.counter
 
     @property

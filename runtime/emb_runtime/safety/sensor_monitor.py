@@ -84,7 +84,8 @@ def begin(angle: float, velocity: float) -> State:
 
 def add(sums: Cusum, error: float, slack_up: float, slack_down: float) -> Cusum:
     """Add an error, less what is allowed of it in each direction."""
-    up, down = sums.up + error - slack_up, sums.down - error - slack_down
+    up, down = sums
+    up, down = up + error - slack_up, down - error - slack_down
     return Cusum(up if up > 0.0 else 0.0, down if down > 0.0 else 0.0)
 
 
@@ -119,37 +120,40 @@ def judge(
     size = abs(angle) + abs(velocity) + abs(command) + abs(reported)
     if not (size <= BELIEVABLE and 0.0 < elapsed <= BELIEVABLE):  # this way round, NaN is no measurement
         return state, CONTRADICTING
+    x, v, travel, up_from, down_from, motion, opposed, lows, highs, flowing, obeys, confirmed = state
     share = elapsed / law.sample_time
-    periods = max(round(share), 1)
-    travelled, expected = angle - state.angle, 0.5 * elapsed * (velocity + state.velocity)
+    periods = round(share)
+    periods = 1 if periods < 1 else periods
+    travelled, expected = angle - x, 0.5 * elapsed * (velocity + v)
     slack = limits.offset * elapsed
     if periods > 1:  # the velocity between is known within a triangle of the greatest acceleration, up or down
         slack += 0.25 * elapsed * elapsed * law.change / law.sample_time
-    travel = add(state.travel, travelled - expected, slack, slack)
-    up_from = velocity if travel.up == 0.0 else state.up_from
-    down_from = velocity if travel.down == 0.0 else state.down_from
-    above = travel.up > limits.travel + lag_angle(limits, velocity - up_from)
-    contradicts = above or travel.down > limits.travel + lag_angle(limits, down_from - velocity)
-    change = velocity - state.velocity
-    xl, xh, vl, vh = state.angle, angle, state.velocity, velocity
+    travel = add(travel, travelled - expected, slack, slack)
+    up, down = travel
+    up_from = velocity if up == 0.0 else up_from
+    down_from = velocity if down == 0.0 else down_from
+    above = up > limits.travel + lag_angle(limits, velocity - up_from)
+    contradicts = above or down > limits.travel + lag_angle(limits, down_from - velocity)
+    change = velocity - v
+    xl, xh, vl, vh = x, angle, v, velocity
     if travelled < 0.0:
-        xl, xh = angle, state.angle
+        xl, xh = angle, x
     if change < 0.0:
-        vl, vh = velocity, state.velocity
+        vl, vh = velocity, v
     aside, beyond = law.angle_noise, law.velocity_noise
     if periods > 1:
         aside += (periods - 1) * law.reach
         beyond += (periods - 1) * law.change
     xl, xh, vl, vh = xl - aside, xh + aside, vl - beyond, vh + beyond
     low, high = _caused(law, limits, periods, obeyed, command, reported, vl, vh)
-    least, most, flowing = _acting(law, state, low, high)
-    lows, highs = state.lows, state.highs
+    least, most, flowing = _acting(law, lows, highs, flowing, low, high)
     for _ in range(min(periods, OLDEST_FRAME + 1)):
-        lows = (low, lows[0], lows[1], lows[2], lows[3], lows[4])
-        highs = (high, highs[0], highs[1], highs[2], highs[3], highs[4])
+        a, b, c, d, e, _ = lows
+        lows = low, a, b, c, d, e
+        a, b, c, d, e, _ = highs
+        highs = high, a, b, c, d, e
     weakest, strongest = drives(law, xl, xh, least, most)
-    motion = add(state.motion, change, share * _gain(law, vl, strongest), share * _gain(law, -vh, -weakest))
-    opposed, obeys, confirmed = state.opposed, state.obeys, state.confirmed
+    motion = add(motion, change, share * _gain(law, vl, strongest), share * _gain(law, -vh, -weakest))
     if confirmed:
         beyond_set = motion.up > limits.motion or motion.down > limits.motion
         verdict = CONTRADICTING if contradicts else OUTSIDE_SET if beyond_set else HONEST
@@ -248,7 +252,8 @@ def _stoppable_current(law: ShieldLaw, limits: SensorThresholds, state: State) -
 
 def lag_angle(limits: SensorThresholds, gained: float) -> float:
     """Angle beyond the integral of a velocity that has gained so much, by its lag; by its lead if it has lost [rad]."""
-    return max(limits.lag * gained, -limits.lead * gained)
+    lag, lead = limits.lag * gained, -limits.lead * gained
+    return lead if lead > lag else lag
 
 
 def _gain(law: ShieldLaw, slowest: float, drive: float) -> float:
@@ -276,9 +281,11 @@ def _caused(
     if obeyed and periods == 1:
         low = high = command
         if reported > command:
-            high = min(reported, command + limits.current_error)
+            high = command + limits.current_error
+            high = high if high < reported else reported
         elif reported < command:
-            low = max(reported, command - limits.current_error)
+            low = command - limits.current_error
+            low = low if low > reported else reported
         return low, high
     late = law.age_high * law.change
     low = min(damped_current(vh + late, law.current, law.damping_velocity), 0.0)
@@ -288,7 +295,9 @@ def _caused(
     return low, high
 
 
-def _acting(law: ShieldLaw, state: State, low: float, high: float) -> tuple[float, float, tuple[float, float]]:
+def _acting(
+    law: ShieldLaw, lows: Currents, highs: Currents, flowing: tuple[float, float], low: float, high: float
+) -> tuple[float, float, tuple[float, float]]:
     """Least and greatest current that may have caused the change between two samples; what may flow after it [A].
 
     That of the period before counts as well: a measured velocity lags. So do those of older ones where frames may be
@@ -297,15 +306,14 @@ def _acting(law: ShieldLaw, state: State, low: float, high: float) -> tuple[floa
     delay = law.delay
     least, most = low, high
     for i in range(_oldest(law) + 1):
-        if state.lows[i] < least:
-            least = state.lows[i]
-        if state.highs[i] > most:
-            most = state.highs[i]
-    low, high = state.flowing
+        low, high = lows[i], highs[i]
+        least = low if low < least else least
+        most = high if high > most else most
+    low, high = flowing
     if delay.lag > 0.0:
         flowing = least + delay.kept * min(low - least, 0.0), most + delay.kept * max(high - most, 0.0)
         return min(least, low), max(most, high), flowing
-    return least, most, state.flowing
+    return least, most, flowing
 
 
 def _judge_polarity(

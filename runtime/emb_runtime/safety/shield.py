@@ -28,7 +28,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from emb_runtime.safety.shield_design import CREEPS, VELOCITY_PAD, ShieldLaw, stoppable, unseen
+from emb_runtime.safety.shield_design import CREEPS, VELOCITY_PAD, ShieldLaw, stoppable
 
 # Values of records.Reason; plain integers, because the compiled function cannot see an IntFlag.
 LIMITED: Final = 2
@@ -102,7 +102,7 @@ def _window_and_box(
     decayed.
     """
     lowest, highest = -law.current, law.current
-    x0 = x1 = v0 = v1 = 0.0
+    x0, x1, v0, v1 = math.inf, -math.inf, math.inf, -math.inf
     for age in range(law.age_low, law.age_high + 1):
         (xl, xh, vl, vh), obeyed = _rolled(law, angle, velocity, past, age)
         if law.coasting:
@@ -114,9 +114,8 @@ def _window_and_box(
         highest = top if top < highest else highest
         lowest = bottom if bottom > lowest else lowest
         xl, xh, vl, vh = obeyed
-        if age > law.age_low:
-            xl, xh, vl, vh = min(x0, xl), max(x1, xh), min(v0, vl), max(v1, vh)
-        x0, x1, v0, v1 = xl, xh, vl, vh
+        x0, x1 = xl if xl < x0 else x0, xh if xh > x1 else x1
+        v0, v1 = vl if vl < v0 else v0, vh if vh > v1 else v1
     if lowest > highest:  # cannot happen to a brake of the set; whatever this is, full braking is right for it
         lowest = highest = -law.current if velocity > 0.0 else law.current
     if law.delay.lag > 0.0:
@@ -280,22 +279,19 @@ def _unseen(
 ) -> tuple[float, float, float, float]:
     """Least and greatest change of the velocity that an observer does not show yet, by a measurement of that age.
 
-    The share (1 + ωτ) exp(−ωτ) of what the acceleration has changed until the time τ before, at most; less what an
-    observer overshoots by. Twice, as of :func:`_rolled`: where commands may have been lost, and where none was.
+    Twice, as of :func:`_rolled`: where commands may have been lost, and where none was.
     """
-    ts, scaled, change, reach = law.sample_time, law.delay.observer, law.change, law.reach
-    blind = unseen(scaled, PAST - age) * change
-    left = 2.0 / scaled
-    aside = blind + left * change
+    ts, change, reach, delay = law.sample_time, law.change, law.reach, law.delay
+    shares, before = delay.hidden
+    blind = before[age] * change
+    aside = blind + (2.0 / delay.observer) * change
     slow, fast = vl - aside, vh + aside
     fallen = fell = -blind
     risen = rose = blind
     for i in range(PAST - age):
         slow, fast = slow - change, fast + change
         down, up, obeyed_down, obeyed_up = _accelerated(law, xl - i * reach, xh + i * reach, slow, fast, past[age + i])
-        before = left
-        left = (2.0 / scaled + i + 1) * math.exp(-scaled * (i + 1))
-        share = (before - left) * ts
+        share = shares[i] * ts
         fallen -= share * (0.0 if down < 0.0 else down)
         risen += share * (0.0 if up < 0.0 else up)
         fell -= share * (0.0 if obeyed_down < 0.0 else obeyed_down)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import pairwise
 from operator import ge, gt, le, lt
 from typing import Final, NamedTuple
 
@@ -62,6 +63,16 @@ class Box(NamedTuple):
     braking_high: float  # Deceleration that the brakes with the strongest motor reach there [rad/s²]
 
 
+class Hidden(NamedTuple):
+    """What an observer does not show yet, in samples that an acceleration counts for; 0 for a sensor."""
+
+    periods: tuple[
+        float, float, float, float, float
+    ]  # In each of the last periods before the measurement, newest first
+    before: tuple[float, float, float, float, float, float]
+    """Before those of them in which own commands are known, by the age of the measurement: :func:`unseen`."""
+
+
 class Delay(NamedTuple):
     """Delay of current and velocity behind the commands, frames that are late apart."""
 
@@ -72,6 +83,7 @@ class Delay(NamedTuple):
 
     It is at most that of an observer that lags no less.
     """
+    hidden: Hidden
 
 
 class WayHome(NamedTuple):
@@ -140,6 +152,20 @@ def unseen(scaled: float, periods: int) -> float:
     """
     began = scaled * periods
     return (2.0 + began) * math.exp(-began) / scaled + OVERSHOOT / min(scaled, SHARPEST)
+
+
+def hidden_by(scaled: float) -> Hidden:
+    """What an observer of that bandwidth times the sample time does not show yet; of 0, a sensor, nothing.
+
+    A critically damped one does not show the share (1 + ωτ) exp(−ωτ) of what the acceleration has changed until the
+    time τ before.
+    """
+    if scaled == 0.0:
+        return Hidden((0.0,) * 5, (0.0,) * 6)
+    left = [2.0 / scaled, *((2.0 / scaled + i + 1) * math.exp(-scaled * (i + 1)) for i in range(OLDEST_FRAME))]
+    a, b, c, d, e = (before - after for before, after in pairwise(left))
+    u, v, w, x, y, z = (unseen(scaled, OLDEST_FRAME - age) for age in range(OLDEST_FRAME + 1))
+    return Hidden((a, b, c, d, e), (u, v, w, x, y, z))
 
 
 def damped_excess(motor: float, friction: float, current: float, damping_velocity: float, sample_time: float) -> float:
@@ -285,7 +311,7 @@ def law_of(bench: Bench) -> ShieldLaw:
         box=box,
         damping_velocity=bench.node.damping_velocity,
         change=change,
-        delay=Delay(lag, math.exp(-ts / lag) if lag > 0.0 else 0.0, observer),
+        delay=Delay(lag, math.exp(-ts / lag) if lag > 0.0 else 0.0, observer, hidden_by(observer)),
         coasting=coasting,
         home=WayHome(
             apex=apex,
@@ -321,7 +347,7 @@ def _conditions(law: ShieldLaw, bench: Bench) -> Iterator[tuple[float, Callable[
 
     In an order in which each has a value where those before it hold.
     """
-    ts, box, home, (lag, _, observer) = law.sample_time, law.box, law.home, law.delay
+    ts, box, home, (lag, _, observer, _) = law.sample_time, law.box, law.home, law.delay
     speed, farthest = bench.limits.velocity, home.apex if law.coasting else bench.limits.angle[1]
     yield (lag > 0.0) + law.coasting + (law.age_high > 0), le, 1, (
         "a lag of the current, frames that may be late and the coasting envelope are covered one at a time; choose one "
@@ -392,7 +418,7 @@ def _conditions(law: ShieldLaw, bench: Bench) -> Iterator[tuple[float, Callable[
 
 def _room(law: ShieldLaw, speed: float, farthest: float) -> float:
     """Room in which the windows against the two angle limits do not both close on a successor box [rad]."""
-    ts, box, (lag, _, observer) = law.sample_time, law.box, law.delay
+    ts, box, (lag, _, observer, _) = law.sample_time, law.box, law.delay
     spread = law.current * (box.motor_high - box.motor_low) + box.friction_low + box.friction_high
     spread += (box.viscous_high - box.viscous_low) * speed + (box.spring_high - box.spring_low) * farthest
     width = 2.0 * law.velocity_noise + (law.age_high + 1) * (2.0 * VELOCITY_PAD + ts * spread)

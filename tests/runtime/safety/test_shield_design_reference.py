@@ -23,6 +23,7 @@ from emb_runtime.safety.shield_design import (
     chatter_excess,
     coasting_excess,
     damped_excess,
+    hidden_by,
     late_step,
     law_of,
     make_law,
@@ -377,6 +378,14 @@ def test_an_observer_is_covered_with_frames_of_one_sample_and_nothing_else(besid
 def test_what_an_observer_lags_by_is_the_integral_of_what_it_does_not_show(scaled: float) -> None:
     for periods in range(6):
         assert unseen(scaled, periods) == pytest.approx(behind(scaled, periods), rel=1e-6)
+    rests = [behind(scaled, i) for i in range(6)]
+    hidden = hidden_by(scaled)
+    assert hidden.before == pytest.approx(rests[::-1], rel=1e-6)
+    assert hidden.periods == pytest.approx([a - b for a, b in itertools.pairwise(rests)], abs=1e-6)
+
+
+def test_a_sensor_of_the_velocity_hides_nothing() -> None:
+    assert make_law(SENSOR_BENCH).delay.hidden == ((0.0,) * 5, (0.0,) * 6)
 
 
 def missing(damping: float, step: float, n: int) -> NDArray[np.float64]:
