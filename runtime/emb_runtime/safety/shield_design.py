@@ -64,7 +64,7 @@ class Box(NamedTuple):
 
 
 class Hidden(NamedTuple):
-    """What an observer does not show yet, in samples that an acceleration counts for; 0 for a sensor."""
+    """Samples that an acceleration counts for in the velocity that an observer does not show yet; 0 for a sensor."""
 
     periods: tuple[
         float, float, float, float, float
@@ -155,7 +155,7 @@ def unseen(scaled: float, periods: int) -> float:
 
 
 def hidden_by(scaled: float) -> Hidden:
-    """What an observer of that bandwidth times the sample time does not show yet; of 0, a sensor, nothing.
+    """Change of the velocity that an observer of this bandwidth times the sample time does not show yet; 0: a sensor.
 
     A critically damped one does not show the share (1 + ωτ) exp(−ωτ) of what the acceleration has changed until the
     time τ before.
