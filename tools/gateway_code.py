@@ -79,7 +79,7 @@ def gateway_code(layout: Layout) -> dict[str, str]:
     messages = "\n".join(
         f"#define {message.name.upper()}_CRC_START (0x{message.crc_start:02x}u)\n"
         f"#define {message.name.upper()}_RESERVED (UINT64_C(0x{message.reserved:x}))"
-        for message in layout.known
+        for message in layout.all_messages
     )
     protection = _E2E.format(
         protocol=layout.protocol_version, last=COUNTER_MODULUS - 1, modulus=COUNTER_MODULUS, messages=messages

@@ -2,7 +2,7 @@
 
 import os
 
-# ONNX Runtime's Linux wheels report to their maker, from a thread of their own, unless told not to before they are
+# ONNX Runtime's Linux wheels report to their maker, from another thread, unless told not to before they are
 # imported: not beside a control loop, and not from a bench computer.
 os.environ["ORT_DISABLE_TELEMETRY"] = "1"
 

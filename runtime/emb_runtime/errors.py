@@ -16,7 +16,7 @@ EXIT_SAFETY_STOP = 3
 EXIT_BUS = 4
 EXIT_POLICY_REFUSED = 5
 EXIT_LOG = 6  # Exit code of a log that cannot be read, or was not written to its end
-EXIT_CANNOT_TELL = 7  # Exit code of a check that what is known neither passes nor fails
+EXIT_CANNOT_TELL = 7  # Exit code of a check that neither passes nor fails
 EXIT_UNEXPLAINED = 8  # Exit code of a run whose measurements no one brake explains
 EXIT_OUTSIDE = 9  # Exit code with --strict of a brake outside of the ranges for which the limits are guaranteed
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as a shell has it
@@ -53,7 +53,7 @@ class UnknownNameError(UsageError, KeyError):
 
 @contextmanager
 def needs(purpose: str, extra: str) -> Iterator[None]:
-    """Imports for a purpose; a library that is missing is a UsageError that says how its extra is installed."""
+    """Imports for a purpose; a library that is missing is a UsageError with the command that installs its extra."""
     try:
         yield
     except ImportError as err:

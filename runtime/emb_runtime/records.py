@@ -34,7 +34,7 @@ class SensorSample(NamedTuple):
     counter: int  # Alive counter of the pair, 0..14
     angle: float  # Measured angle [rad]
     velocity: float  # Measured (observer) velocity [rad/s]
-    device_time_ns: int  # The node's own time of the sampling instant, unwrapped [ns]
+    device_time_ns: int  # The node's time of the sampling instant, unwrapped [ns]
     receive_time_ns: int  # Monotonic arrival time of the later frame of the two [ns]
     applied_current: float  # Current that the node applied in the period ending at this sample [A]
     command_counter: int  # Counter of the command that the node obeyed in that period; 15 if it obeyed none
@@ -120,7 +120,7 @@ class CycleRecord(NamedTuple):
     policy_current: float  # Raw output of the policy [A]
     clipped_current: float  # After the finite check and the clip [A]
     sent_current: float  # After the shield: what the guard let out [A]
-    device_time_ns: int  # The node's own time of the sample
+    device_time_ns: int  # The node's time of the sample
     receive_time_ns: int  # Arrival of the later frame of the pair
     wake_time_ns: int  # Time at which the loop had the frames of the read that completed the pair
     decide_time_ns: int  # Time at which policy, clip and shield had answered and the frame was ready; 0 if it never was

@@ -53,7 +53,7 @@ def write_trace(
         wall_offset_ns=WALL,
         simulated=True,
         dbc=layout.text,
-        messages=layout.known,
+        messages=layout.all_messages,
         metadata={"emb.run": {"steps": str(steps), "purpose": "experiment", "limit": "6.0", **identity}},
         attachments=files,
         topics=["/estimate"] if estimated(bench) else [],

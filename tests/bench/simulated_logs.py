@@ -43,7 +43,7 @@ def write_log(
         wall_offset_ns=wall,
         simulated=True,
         dbc=load_layout().text,
-        messages=load_layout().known,
+        messages=load_layout().all_messages,
         metadata={
             "emb.run": {"steps": str(steps), "iface": "sim", "purpose": "experiment", "limit": "6.0"},
             "emb.truth": {name: str(value) for name, value in run.transport.truth.items()},

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from cantools.database.can import Database
 
 
-Number = int | float  # An int where it is whole
+Number = int | float  # An int where it has no fraction
 
 
 class Fault(StrEnum):
@@ -38,7 +38,7 @@ class Fault(StrEnum):
 
 
 class FrameRejectedError(FrameError):
-    """A received frame does not fit its message; ``fault`` says how."""
+    """A received frame does not fit its message; ``fault`` is the reason."""
 
     def __init__(self, message: str, fault: Fault) -> None:
         super().__init__(message)
@@ -53,7 +53,7 @@ class Signal:
     unit: str
     minimum: Number  # Least value in ``unit``; beyond it nothing is sent and nothing believed
     maximum: Number
-    factor: Number  # Step in ``unit``; 1 where the values are whole numbers
+    factor: Number  # Step in ``unit``; 1 where the values are integers
     shift: int  # Bits below it in the payload as one little-endian word
     mask: int  # Bit mask of the signal's width
     sign: int  # Its sign bit; 0 if unsigned
@@ -129,7 +129,7 @@ class Message:
 
 
 def from_document(found: Mapping[str, Any]) -> Message:
-    """A message of its fields as JSON has them; by hand, since a compiled record does not tell the types of its own."""
+    """A message of its fields as JSON has them; by hand: a compiled record has no types of fields."""
     return Message(**{**found, "signals": tuple(Signal(**signal) for signal in found["signals"])})
 
 
@@ -204,5 +204,5 @@ def _describe_signal(source: Any) -> Signal:
 
 
 def _number(value: float) -> Number:
-    """An int where the number is whole, so that counters and states decode to ints."""
+    """An int where the number has no fraction, so that counters and states decode to ints."""
     return int(value) if float(value).is_integer() else float(value)

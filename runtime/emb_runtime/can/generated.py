@@ -18,14 +18,14 @@ from emb_runtime.records import Frame
 
 @dataclass(frozen=True)
 class Field:
-    """A signal as a field of a record: its physical value, if nothing else is said."""
+    """A signal as a field of a record: its physical value by default."""
 
     signal: str
     choices: tuple[object, ...] = ()  # Objects in place of the values 0, 1, ...
-    scale: int = 1  # Steps of the record in a unit of the signal: 10**9 for nanoseconds; then both are whole numbers
+    scale: int = 1  # Steps of the record in a unit of the signal: 10**9 for nanoseconds; then both are integers
     wraps: bool = False  # A value beyond the signal's bits is encoded modulo them
     saturates: bool = False  # A value beyond the greatest is encoded as the greatest
-    fixed: int | None = None  # Encoded whatever the record says: no argument of the encoder
+    fixed: int | None = None  # Encoded in each frame: no argument of the encoder
 
 
 class Codec(NamedTuple):
@@ -41,7 +41,7 @@ def generate_codec(message: Message, record: type[Any], fields: tuple[Field, ...
     Those that are not fixed are the arguments of the encoder.
     """
     coded = [_Coded(message.signal(field.signal), field, f"v{at}") for at, field in enumerate(fields)]
-    known: dict[str, Any] = {
+    names: dict[str, Any] = {
         "T": CRC_TABLE,
         "Frame": Frame,
         "Record": record,
@@ -52,8 +52,8 @@ def generate_codec(message: Message, record: type[Any], fields: tuple[Field, ...
         "FrameError": FrameError,
         **{f"choices_{c.name}": c.field.choices for c in coded},
     }
-    exec(_encoder(message, coded) + _decoder(message, coded), known)
-    return Codec(known["encode"], known["decode"])
+    exec(_encoder(message, coded) + _decoder(message, coded), names)
+    return Codec(names["encode"], names["decode"])
 
 
 class _Coded(NamedTuple):
@@ -81,8 +81,8 @@ class _Coded(NamedTuple):
         if self.field.fixed is not None:
             return str(self.field.fixed)
         if self.field.wraps:
-            whole = f"({value} + {step // 2}) // {step}" if isinstance(step, int) else f"round({value} / {step!r})"
-            return f"{whole} & {self.signal.mask}"
+            steps = f"({value} + {step // 2}) // {step}" if isinstance(step, int) else f"round({value} / {step!r})"
+            return f"{steps} & {self.signal.mask}"
         if self.field.saturates:
             value = f"min({value}, {self.signal.maximum!r})"
         return f"int({value})" if self.signal.factor == 1 else f"round({value} / {step!r})"

@@ -28,7 +28,7 @@ class StopReason(IntEnum):
     NONE = 0
     NEVER_COMMANDED = 1
     WATCHDOG = 2  # No fresh, valid, enabled command for the watchdog's time
-    DISABLED = 3  # The host said disabled
+    DISABLED = 3  # The host's command was disabled
     LIMIT = 4  # The brake reached a limit of the bench
 
 
@@ -37,7 +37,7 @@ class AngleFrame(NamedTuple):
 
     counter: int  # Alive counter, 0..14
     angle: float  # [rad]
-    device_time_ns: int  # The node's own time of the sampling instant, wrapped to ``Layout.device_time_period_ns`` [ns]
+    device_time_ns: int  # The node's time of the sampling instant, wrapped to ``Layout.device_time_period_ns`` [ns]
 
 
 class VelocityFrame(NamedTuple):
@@ -131,8 +131,8 @@ class Layout:
         return {message.name: message for message in (self.command, self.angle, self.velocity, self.status)}
 
     @property
-    def known(self) -> tuple[Message, ...]:
-        """All messages, those included that need not be sent."""
+    def all_messages(self) -> tuple[Message, ...]:
+        """All messages, the optional ones included."""
         return (*self.messages.values(), *self.optional.values())
 
     @property
@@ -144,7 +144,7 @@ class Layout:
     def current_within(self, limit: float) -> float:
         """The largest current that a command can carry and that is not beyond a limit [A]."""
         step = self.command.signal("Current").factor
-        return math.floor(limit / step + 1e-6) * step  # a limit of whole steps may be no whole number of them in floats
+        return math.floor(limit / step + 1e-6) * step  # in floats a multiple of the step may lie just below it
 
     def bus_load(self, bitrate: int) -> float:
         """Worst-case share of the bus that ``messages`` take at their cycle times and a bitrate; 1.0 is all of it."""

@@ -1,17 +1,16 @@
 """Receiver: pairs valid, fresh and plausible frames to sensor samples, and counts the rejected ones.
 
-Pure: frames with their arrival times go in. Each message of the node has a :class:`MessageState`. What is asked of
-a frame, in this order:
+Pure: frames with their arrival times go in. Each message of the node has a :class:`MessageState`. Checks of a frame, in
+this order:
 
-- kind: a standard data frame. Error frames, the echo of our own and frames of others are told apart before. Whoever
-  else uses the identifier of our command is a second commander, with a copy of our own frame too: an echo is known by
-  the mark that the kernel gives it, not by what it says.
+- kind: a standard data frame. Error frames, echoes of sent frames and other messages are sorted out before. Any other
+  frame with the identifier of the command is a second commander's, even a copy of a sent one: the kernel marks an echo.
 - length, CRC over data id and payload, alive counter 0..14, reserved bits zero, every signal within its range: a node
   state or stop reason that has no name is none.
 - the counter is not that of the last accepted frame. A rejected frame moves no counter, only a leaky count: too many
   in a row stop the run, and a share of more than a fifth.
 - an angle and a velocity of one counter make a sample if the device time has moved on, and the angle by what the
-  velocities say (no jump). That one is rejected is counted for the pair.
+  velocities imply (no jump). A rejection counts for the pair.
 - period: two of its periods after the last valid frame of any message no current may be commanded until it is back.
 """
 
@@ -36,7 +35,7 @@ _NEVER: Final = -(1 << 62)
 
 Content = TypeVar("Content", bound=AngleFrame | VelocityFrame | StatusFrame)
 
-# What an error frame reports, by <linux/can/error.h>. It is the kernel's own message, never on the bus. Its identifier
+# What an error frame reports, by <linux/can/error.h>. It is a message of the kernel, never on the bus. Its identifier
 # has one bit per kind of error, so it must be told apart first: the bit of a bus error, 0x080, is also our command.
 BUS_OFF: Final = "bus-off"  # The controller has stopped taking part
 KINDS: Final = {
@@ -59,9 +58,9 @@ CONTROLLER_KINDS: Final = {
     0x20: "error passive by transmit errors",
     0x40: "error active again",
 }
-"""By bit of byte 1, where the identifier says that the controller has a problem."""
+"""By bit of byte 1, where the identifier has the bit of a controller problem."""
 WITHOUT_DETAILS: Final = "controller problem without details"
-UNKNOWN: Final = "of a class that is not known here"
+UNKNOWN: Final = "of an unknown class"
 
 _CONTROLLER: Final = 0x004
 _COUNTERS: Final = 0x200  # The controller's error counters, which may come alone and are no error then

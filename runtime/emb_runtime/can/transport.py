@@ -35,7 +35,7 @@ _SFF_MASK: Final = 0x7FF  # the hot path's, as plain numbers
 _MSG_CONFIRM: Final = 0x800
 _MSG_DONTWAIT: Final = 0x40
 _OFFSET_ERROR_NS: Final = 20_000  # Error of a measured offset of the two clocks, at most; more is a step [ns]
-_OFFSETS: Final = 16  # Offsets that are kept while the queue is never empty
+_OFFSETS: Final = 16  # Offsets stored while the queue is never empty
 _DELIVERY_NS: Final = 1_000_000_000  # Longest time from a stamp until the frame is in the queue [ns]
 
 
@@ -58,7 +58,7 @@ class Transport(Protocol):
 
     @property
     def obtained(self) -> Mapping[str, str]:
-        """Settings of the bus that were asked for, and what was obtained, for the log."""
+        """Requested settings of the bus, and what was obtained, for the log."""
         ...
 
     def send(self, frame: Frame) -> None:
@@ -66,7 +66,7 @@ class Transport(Protocol):
         ...
 
     def receive(self, deadline_ns: int) -> Frame | None:
-        """The next frame, error frames and the echo of own frames included; None if none came by the deadline.
+        """The next frame, error frames and echoes of sent frames included; None if none came by the deadline.
 
         That is on the monotonic clock that came with the transport; one in the past, 0 say, only looks. BusError if the
         bus is lost.
@@ -79,7 +79,7 @@ class Transport(Protocol):
 
 
 class SocketCan:
-    """A raw SocketCAN socket: classical frames, kernel time stamps, drop count, error frames, own echo."""
+    """A raw SocketCAN socket: classical frames, kernel time stamps, drop count, error frames, echoes."""
 
     truth = None
 
@@ -92,7 +92,7 @@ class SocketCan:
         open_socket: Callable[[], socket.socket] = lambda: socket.socket(
             socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW
         ),
-        # select() and not poll(), whose timeout has a resolution of one millisecond: a whole sample time.
+        # select() and not poll(), whose timeout has a resolution of one millisecond: a sample time.
         wait_readable: Callable[[int, float], object] = lambda fd, timeout_s: select.select([fd], [], [], timeout_s)[0],
     ) -> None:
         """Open and bind the socket of a network interface; BusError where that cannot be.
@@ -220,10 +220,10 @@ class SocketCan:
         """Arrival of a frame that has just been read, by the kernel's stamp; both [ns].
 
         The stamp is the wall clock's, which may step at any time. What is sure is monotonic: the frame was put into the
-        queue after that was last seen empty, and before now. Within these bounds it came as the stamp says by an offset
-        of the two clocks that was measured in between. Where a step has left several of them, the earliest arrival
-        counts. Where none fits, the kernel was late with it, and it came before the queue was seen empty; or, as of a
-        step that was taken back, the lower bound counts. So a step makes a frame look older, not newer, and only one
+        queue after that was last seen empty, and before now. Within these bounds the arrival is the stamp less an
+        offset of the two clocks that was measured in between: after a step there are several, and the earliest arrival
+        counts. Where none fits, the kernel delivered the frame late, and it came before the queue was seen empty; or
+        the step was taken back, and the lower bound counts. So a step makes a frame look older, not newer, and only one
         that waited meanwhile or was the first to be read after it.
         """
         clock = self._clock
@@ -232,7 +232,7 @@ class SocketCan:
             self._offsets_ns = [*self._offsets_ns[1 - _OFFSETS :], offset_ns]
         empty_ns, now_ns = self._empty_ns, clock.now_ns()
         earliest_ns, latest_ns = empty_ns - _OFFSET_ERROR_NS, now_ns + _OFFSET_ERROR_NS
-        times_ns = [wall_ns - known_ns for known_ns in self._offsets_ns]
+        times_ns = [wall_ns - offset_ns for offset_ns in self._offsets_ns]
         if possible_ns := [time_ns for time_ns in times_ns if earliest_ns <= time_ns <= latest_ns]:
             return min(max(min(possible_ns), empty_ns), now_ns)
         return max((time_ns for time_ns in times_ns if 0 < empty_ns - time_ns < _DELIVERY_NS), default=empty_ns)

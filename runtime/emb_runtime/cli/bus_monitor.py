@@ -20,13 +20,13 @@ from emb_runtime.system.clock import Clock
 if TYPE_CHECKING:
     from emb_runtime.drives.mapping import Mapping as DriveMapping
 
-ENOUGH_PAIRS = 200  # Sensor pairs from which a standard deviation is known to within a twentieth
+ENOUGH_PAIRS = 200  # Sensor pairs that give a standard deviation to within a twentieth
 RECENT_PAIRS = 4000  # Pairs that the scatter is taken from
 OTHERS_BITS = worst_bits(8)  # Bits of a foreign frame, counted as one of 8 bytes with an 11-bit identifier
 
 
 def planned_load(bench: Bench, layout: Layout, drive: DriveMapping | None) -> float:
-    """Worst-case share of the bus that a run takes, 1.0 being all of it: of a mapped drive's own, if there is one."""
+    """Worst-case share of the bus that a run takes, 1.0 being all of it: of a mapped drive's bus, if there is one."""
     return layout.bus_load(bench.can.bitrate) if drive is None else drive.bus_load(bench.timing.sample_time)
 
 
@@ -47,7 +47,7 @@ class BusStatistics:
     rates: Mapping[str, float]  # Mean rate by message name, of those seen at least twice [1/s]
     others: int  # Data and remote frames that are none of the DBC's
     load: float
-    """Share of the bus that all frames took, with every stuff bit that there can be; of a mapped drive's its own."""
+    """Share of the bus that all frames took, with every stuff bit that there can be."""
     rejections: Mapping[str, Mapping[str, int]]  # Rejections as in :class:`~emb_runtime.control.result.Outcome`
     distrusted: bool  # True after so many of them that a run would have been stopped
     bus_errors: Mapping[str, int]  # Bus errors as in :class:`~emb_runtime.control.result.Outcome`
@@ -55,8 +55,8 @@ class BusStatistics:
     commanded: bool  # Another sender commands the node
     pairing_problem: str  # :attr:`~emb_runtime.can.receiver.Reception.pairing_problem`
     pairs: int  # Valid sensor pairs
-    missing: int  # Pairs that did not come, by the node's own clock
-    period: float  # Median time between samples by the node's own clock [s]; NaN with fewer than two
+    missing: int  # Pairs that did not come, by the node's clock
+    period: float  # Median time between samples by the node's clock [s]; NaN with fewer than two
     scatter: Scatter
     status: StatusFrame | None  # The node's latest
     sample: SensorSample | None  # The newest valid one
@@ -88,7 +88,7 @@ class BusMonitor:
     def __init__(self, layout: Layout, bench: Bench, on_rejected: Callable[[Frame, str], None]) -> None:
         self._bench = bench
         self._layout = layout
-        self._names = {message.identifier: message.name for message in layout.known}
+        self._names = {message.identifier: message.name for message in layout.all_messages}
         self._reception = Reception(layout, bench, on_rejected)
         self._seen: dict[str | None, Seen] = {}  # By message name; None for those that are none of the DBC's
         self._periods_ns: deque[int] = deque(maxlen=RECENT_PAIRS)
@@ -123,15 +123,15 @@ class BusMonitor:
         reception, seen = self._reception, self._seen
         spans = seen.values()
         duration = (max(s.last_ns for s in spans) - min(s.first_ns for s in spans)) * 1e-9 if seen else 0.0
-        known = {name: s for name, s in seen.items() if name is not None}
-        frames, others = {name: s.frames for name, s in known.items()}, seen[None].frames if None in seen else 0
-        bits = OTHERS_BITS * others + sum(m.worst_bits * frames.get(m.name, 0) for m in self._layout.known)
+        named = {name: s for name, s in seen.items() if name is not None}
+        frames, others = {name: s.frames for name, s in named.items()}, seen[None].frames if None in seen else 0
+        bits = OTHERS_BITS * others + sum(m.worst_bits * frames.get(m.name, 0) for m in self._layout.all_messages)
         enough = len(self._at_rest) > 1
         scatter = map(statistics.stdev, zip(*self._at_rest, strict=True)) if enough else (math.nan, math.nan)
         return BusStatistics(
             duration=duration,
             frames=frames,
-            rates={name: s.rate() for name, s in known.items() if s.last_ns > s.first_ns},
+            rates={name: s.rate() for name, s in named.items() if s.last_ns > s.first_ns},
             others=others,
             load=bits / duration / self._bench.can.bitrate if duration > 0.0 else 0.0,
             rejections=reception.rejections(),
@@ -175,7 +175,7 @@ def listen(
     enough: Callable[[SensorSample, int], bool],
     stop_requested: Callable[[], bool],
 ) -> None:
-    """Listen until so many pairs were heard and the last of them were good enough, or until a deadline.
+    """Listen until enough pairs have come and the last of them are good enough, or until a deadline.
 
     What was on the bus before this was called may have waited in the kernel for long: of that, alarming frames count.
 
@@ -186,7 +186,7 @@ def listen(
         period_ns: the sampling period [ns].
         deadline_ns: monotonic [ns].
         enough: True if a sample that was in hand at a time (monotonic [ns]) is as it should be.
-        stop_requested: True if the operator wants an end.
+        stop_requested: True if the operator has ended the command.
     """
     begin_ns = now_ns = clock.now_ns()
     ready = 0

@@ -58,8 +58,8 @@ class RunResult:
     def outside(self) -> dict[str, tuple[float, float, float, str]]:
         """Estimates at or beyond the border of the ranges for which the limits hold: value, range, name of the ranges.
 
-        The estimator does not go beyond the ranges itself. It relies on the response: before that is proven, a run that
-        ended says nothing about the brake.
+        The estimator does not go beyond the ranges itself. It relies on the response: before that is proven, an
+        estimate may be wrong.
         """
         if self.outcome.fault is not None and not self.outcome.response:
             return {}
@@ -86,7 +86,7 @@ class RunResult:
         plan, outcome = self.plan, self.outcome
         result = result_document(outcome.fault, self.exit_code, outcome.detail)
         if outcome.fault is None and not self.log.complete:
-            result |= {"result": LOG_INCOMPLETE, "cause": "the log is not whole", "detail": self.log.error}
+            result |= {"result": LOG_INCOMPLETE, "cause": "the log is not complete", "detail": self.log.error}
             result |= {"advice": "brake and node worked as they should; repeat the run for its data"}
         return {
             **result,
@@ -220,7 +220,7 @@ def header(
         wall_offset_ns=clock.wall_offset_ns(),
         simulated=truth is not None,
         dbc=plan.layout.text,
-        messages=plan.layout.known,
+        messages=plan.layout.all_messages,
         metadata={name: log_entries(record) for name, record in records.items()},
         attachments=tuple(attachments),
         topics=["/estimate"] if is_experiment and estimated(bench) else [],

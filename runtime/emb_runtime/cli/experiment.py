@@ -21,7 +21,7 @@ from emb_runtime.system.clock import Clock
 def experiment(
     plan: Plan, path: Path, console: Console, opened: tuple[Transport, Clock] | None = None
 ) -> tuple[dict[str, Any], int]:
-    """Run one experiment on a bus, and bring the brake home before and after it where that is asked for and needed.
+    """Run one experiment on a bus; bring the brake home before and after it where the plan has that and it is not.
 
     The log must not exist; those of the ways home are called alike. A bus that is ``opened`` already stands for that of
     the plan, and is closed too.
@@ -37,7 +37,7 @@ def experiment(
     """
     # The kernel keeps what is not in the DBC away: a babbling stranger must not cost the loop its period. Another
     # commander still shows, for he uses an identifier of the DBC; --read-only shows all that is on the bus.
-    identifiers = tuple(message.identifier for message in plan.layout.known)
+    identifiers = tuple(message.identifier for message in plan.layout.all_messages)
     transport, clock = opened or open_transport(plan.iface, plan.bench, identifiers)
     bus = Bus(plan.iface, transport, clock)
     assert plan.experiment is not None
@@ -69,7 +69,7 @@ def _go_home(plan: Plan, bus: Bus, path: Path, console: Console, homing: dict[st
     # The run may have ended before the node told why it stopped: the status is rarer than the samples.
     if when == "after" and status is not None and status.stop_reason is StopReason.LIMIT:
         return EXIT_SAFETY_STOP
-    if sample is not None and Bounds(plan.bench).is_home(sample):  # without one the pre-flight says why
+    if sample is not None and Bounds(plan.bench).is_home(sample):  # without one the pre-flight refuses
         return EXIT_DONE
     log = path.with_name(f"{path.stem}-{when}{HOMING_LOG}{path.suffix}")
     way = conduct(plan, bus, RunType.HOMING, log, console)

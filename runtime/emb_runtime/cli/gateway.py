@@ -1,4 +1,4 @@
-"""``emb-gateway``: a drive with a DBC of its own as a node on a bus that speaks ours."""
+"""``emb-gateway``: a drive with another DBC as a node on a bus with ``emb.dbc``."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ LOOK = 0.05  # Time between two looks at the keyboard [s]
 LOOK_NS = 200_000  # Time between two looks at a bus that cannot be waited for [ns]
 LONGEST_WAIT_NS = 10_000_000  # Time between two looks at the operator's end [ns]
 DESCRIPTION = """\
-Translate between a drive with a protocol of its own, on one bus, and emb-run with emb.dbc, on another bus.
+Translate between a drive with another protocol, on one bus, and emb-run with emb.dbc, on another bus.
 
-The gateway first tests that the drive's own time-out switches the current off, if the drive reports its state. Then it
+The gateway first tests that the drive's time-out switches the current off, if the drive reports its state. Then it
 arms the drive by the sequence of the mapping file. The drive stays armed until the gateway ends; without a run it gets
 0 A. The gateway is a node: it brakes by itself if no command comes. A second guard checks each frame to the drive.
 After a stop that emb-run did not request, the gateway disarms the drive and ends.
@@ -100,7 +100,7 @@ def _serve(args: argparse.Namespace) -> int:
         )
     if args.listen and mapping.polled:
         raise UsageError(
-            f"--listen: {mapping.name} sends nothing unless it is asked; only a drive that broadcasts is heard"
+            f"--listen: {mapping.name} sends nothing unless it is polled; only a drive that broadcasts has samples"
         )
     if "no_identity" in mapping.lost and not (args.serial or args.listen):
         raise UsageError(

@@ -41,7 +41,7 @@ VIEWER_TIMEOUT = 10.0  # Longest wait for the process to be ready [s]
 
 
 class Operator(Console):
-    """Operator: sees the pre-flight, and is asked once before anything is armed."""
+    """Operator: sees the pre-flight, and confirms once before anything is armed."""
 
     def __init__(self, plan: Plan, stop_requested: StopRequest) -> None:
         self._plan = plan
@@ -49,7 +49,7 @@ class Operator(Console):
         self._seen = self._agreed = False
 
     def show(self, checks: tuple[Check, ...], bus: Bus) -> None:
-        """Show the checks that are not ok, below the stage: it says what they are of. All where they are agreed to."""
+        """Show the stage, and the checks that are not ok; all of them where the operator is to confirm."""
         output, asks = self._plan.output, self._asks(bus)
         full = not self._seen and (output.verbose or asks)
         silent = output.json and not asks
@@ -161,7 +161,7 @@ def _experiment(plan: Plan, console: Console) -> int:
 
 
 def _reporter(page: Path) -> str:
-    """Module whose command ``report`` writes a page; asked for before the run."""
+    """Module whose command ``report`` writes a page; looked up before the run."""
     module = _viewer("report", "writes a page")
     if page.suffix not in (".html", ".htm"):
         raise UsageError(f"--report {page}: expected a name that ends in .html or .htm")

@@ -47,13 +47,13 @@ the simulated bus:
     charge                       1: the node also sends the integral of its current (default: 0)
 
 exit codes:
-  0  the experiment was completed, and its log is whole; with --read-only: the node is ready
+  0  the experiment was completed, and its log is complete; with --read-only: the node is ready
   1  with --read-only: too many samples of the node are missing
   2  usage: wrong argument, unreadable file, bench file refused, log cannot be written
   3  safety stop: a fault, Ctrl-C or SIGTERM ended the run; stop frames were sent unless nothing had been sent before
   4  bus: the interface cannot be opened, was lost, or no node is on it
   5  the policy was refused: damaged, or made for another bench
-  6  the experiment was completed, but its log is not whole (disk full, recorder killed)
+  6  the experiment was completed, but its log is not complete (disk full, recorder killed)
   8  no single brake explains what the node reported: a sensor, its zero, the reported current, or the drive is wrong
   9  with --strict: the experiment was completed, but the estimate lies outside the ranges of the bench file: the \
 limits were not guaranteed
@@ -105,8 +105,8 @@ def parser() -> argparse.ArgumentParser:
     actor.add_argument("--policy", type=Path, metavar="FILE",
         help="policy as ONNX file with its contract (default: the shipped one)")
     actor.add_argument("--quick", action="store_true",
-        help="use the shipped policy for a short experiment: it returns home and ends when all four parameters are "
-        f"known to a repeatability of {QUICK_GOAL}% (the total also has the error of J), or to that of --stop-when")
+        help="use the shipped policy for a short experiment: it returns home and ends when all four parameters have "
+        f"a repeatability of {QUICK_GOAL}% (the total also has the error of J), or to that of --stop-when")
     what.add_argument("--bench", type=Path, metavar="FILE", help="bench file (default: the shipped drum brake)")
     what.add_argument("--log", type=_place, default=Path("runs"), metavar="FILE|DIR",
         help="MCAP file to write (a name with a suffix), or a folder for a file named after the time (default: runs/)")
@@ -116,7 +116,7 @@ def parser() -> argparse.ArgumentParser:
         help="return home and end early when the repeatability of the running estimate is below these "
         "shares of its values: k_1=1%%,f_v=5%%")
     what.add_argument("--live", nargs="?", type=int, const=LIVE_PORT, metavar="PORT",
-        help="show the run while it goes on, from a process of its own: to browsers, Foxglove and Lichtblick at "
+        help="show the run while it goes on, from another process: to browsers, Foxglove and Lichtblick at "
         f"this port (default: {LIVE_PORT}; needs the extra [live]). On a terminal the page stays after the run, until "
         "Ctrl-C")
     what.add_argument("--open", action="store_true", help="open the page of --live in the browser")
@@ -134,7 +134,7 @@ def parser() -> argparse.ArgumentParser:
     output.add_argument("-q", "--quiet", action="store_true", help="print the verdict only")
     what.add_argument("--home", action="store_true",
         help="bring the brake to the origin before and after the experiment; each way home is guarded like a run and "
-        "has its own log, ...-home.mcap")
+        "has a log, ...-home.mcap")
 
     stage = p.add_argument_group("stage: how much of the chain may act (default: all of it)")
     one = stage.add_mutually_exclusive_group()

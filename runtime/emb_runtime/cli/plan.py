@@ -31,10 +31,10 @@ class Stage(StrEnum):
 
 @dataclass(frozen=True)
 class MappedDrive:
-    """A drive with a DBC of its own, behind the node."""
+    """A drive with another DBC, behind the node."""
 
     mapping: Mapping
-    bus: str  # Its own bus, whose frames are recorded; "" in lock-step
+    bus: str  # Its bus, whose frames are recorded; "" in lock-step
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Output:
 
 @dataclass(frozen=True)
 class Label:
-    """Origin of a run, for its log; empty texts where nothing was said."""
+    """Origin of a run, for its log; empty texts where there is none."""
 
     typed: Sequence[str]  # Arguments as they were typed
     operator: str

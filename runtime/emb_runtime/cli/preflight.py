@@ -1,7 +1,7 @@
 """Pre-flight: a table of checks on what was found, before anything is armed.
 
-Pure: :class:`Findings` go in, one :class:`Check` of each of :data:`CHECKS` comes out. One that refuses says with which
-error the run ends, before any frame has left.
+Pure: :class:`Findings` go in, one :class:`Check` of each of :data:`CHECKS` comes out. One that refuses has the
+error with which the run ends, before any frame is sent.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class Findings:
     watchdog: str  # Watchdog, in words; empty for none
     core: Core  # Compiled or not
     realtime: Mapping[str, str] | None
-    """Real-time settings, see :func:`emb_runtime.system.realtime.obtain`; None where none were asked for."""
+    """Real-time settings, see :func:`emb_runtime.system.realtime.obtain`; None where none were requested."""
 
 
 def run_checks(findings: Findings) -> tuple[Check, ...]:
@@ -145,7 +145,7 @@ def _stage(f: Findings) -> Check:
         Stage.FULL: f"up to {limit:g} A",
     }
     where = ", on the way home" if f.start_conditions.anywhere else ""
-    return Check("stage", f"{stage}{where}: {sent[stage]}, for {f.duration:g} s", "as asked for")
+    return Check("stage", f"{stage}{where}: {sent[stage]}, for {f.duration:g} s", "as requested")
 
 
 def _interface(f: Findings) -> Check:
@@ -210,7 +210,7 @@ def _noise(f: Findings) -> Check:
         f"for {f.plan.bench.shield.noise_sigmas:g} times that"
     )
     if not math.isfinite(angle + velocity):
-        return Check("noise at rest", "not known: no samples at rest", expected, ok=False)
+        return Check("noise at rest", "unknown: no samples at rest", expected, ok=False)
     ok = angle <= SCATTER_TOLERANCE * noise.angle and velocity <= SCATTER_TOLERANCE * noise.velocity
     found = f"{angle:.2g} rad and {velocity:.2g} rad/s{'' if ok else ': noise, or a brake that still creeps'}"
     return Check("noise at rest", found, expected, ok)
@@ -282,14 +282,14 @@ def _watchdog(f: Findings) -> Check:
     if f.in_process or f.plan.stage is Stage.READ_ONLY:
         why = "no other process has this bus" if f.in_process else "nothing is sent"
         return Check("watchdog", "none needed", f"none: {why}")
-    expected = "a process of its own, above the loop's priority"
+    expected = "a process above the loop's priority"
     return Check("watchdog", f.watchdog or "NONE", expected, ok=bool(f.watchdog))
 
 
 def _realtime(f: Findings) -> Check:
     if f.realtime is None:
         needed = not f.in_process and f.plan.stage is not Stage.READ_ONLY
-        return Check("real time", "not asked for", "all settings" if needed else "not needed", ok=not needed)
+        return Check("real time", "not requested", "all settings" if needed else "not needed", ok=not needed)
     settings = {name.replace("_", " "): value for name, value in f.realtime.items()}
     lacking = {name: value for name, value in settings.items() if value.startswith("not obtained")}
     found = "; ".join(f"{name}: {value}" for name, value in (lacking or settings).items())
@@ -323,4 +323,4 @@ CHECKS: tuple[Callable[[Findings], Check], ...] = (
     *(_stage, _interface, _node, _state, _samples, _noise, _bus_load),
     *(_disk, _shield, _slew, _policy, _watchdog, _realtime, _core),
 )
-"""In the order of the table; the first that refuses says why."""
+"""In the order of the table; the first that refuses ends the run."""

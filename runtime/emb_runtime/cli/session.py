@@ -1,6 +1,6 @@
 """One run on an open bus: watchdog, real time, pre-flight, leave of the operator, recorder, loop, and what came of it.
 
-The recorder and the watchdog are processes of their own; of the loop's scheduling they inherit nothing.
+The recorder and the watchdog are other processes; they inherit nothing of the loop's scheduling.
 """
 
 from __future__ import annotations
@@ -73,9 +73,9 @@ class Bus:
 
 
 class Console:
-    """User interface; this one shows nothing, agrees, and wants no end."""
+    """User interface; this one shows nothing, agrees, and never stops."""
 
-    stop_requested: Callable[[], bool] = staticmethod(lambda: False)  # Returns True if an end is wanted
+    stop_requested: Callable[[], bool] = staticmethod(lambda: False)  # Returns True once the operator ends it
 
     def show(self, checks: tuple[Check, ...], bus: Bus) -> None:
         """Show the pre-flight."""
@@ -161,7 +161,7 @@ def drop_backlog(bus: Bus, layout: Layout) -> tuple[Frame, ...]:
 def observe(
     plan: Plan, bus: Bus, start_conditions: StartConditions, stop_requested: Callable[[], bool]
 ) -> BusStatistics:
-    """Listen until a run may begin, or for as long as the bench says."""
+    """Listen until a run may begin, or for the ``start_timeout`` of the bench."""
     monitor = BusMonitor(plan.layout, plan.bench, lambda _frame, _why: None)
     deadline_ns = bus.clock.now_ns() + round(plan.bench.watch.start_timeout * 1e9)
 
@@ -185,7 +185,7 @@ def findings(
     watchdog: WatchdogHandle | None = None,
     obtained: dict[str, str] | None = None,
 ) -> Findings:
-    """Findings for the pre-flight; the real-time settings are None where none were asked for."""
+    """Findings for the pre-flight; the real-time settings are None where none were requested."""
     watched = ""
     if watchdog is not None:
         priority = watchdog.realtime.get("scheduler", "ordinary scheduling")
@@ -250,7 +250,7 @@ def paced_receive(bus: Bus, recorder: Recorder) -> Callable[[int], Frame | None]
 
 
 def listen_only(plan: Plan, bus: Bus, path: Path, console: Console) -> tuple[dict[str, Any], tuple[Check, ...]]:
-    """Listen for as long as was asked for, and log all that comes; nothing is ever sent.
+    """Listen for the duration of the plan, and log all that comes; nothing is ever sent.
 
     Returns:
         The result as a document, and the pre-flight of the bus.

@@ -39,7 +39,7 @@ def text(s: Document, details: bool = False) -> str:
     counts = sampled and (details or not is_done or s["unanswered"] or s["missed"] or s["rejected"])
     rest, reason = "at rest" if s["node_at_rest"] else "still stopping", s["node_stop_reason"] or "not reported"
     lacking = ", ".join(name for name, value in s["realtime"].items() if value.startswith("not obtained"))
-    rows = [  # Label, and text; without one the row is left out
+    rows = [  # Label, and text; an empty text makes no row
         *(("OUTSIDE", _outside(name, s)) for name in s["outside"]),
         *(("way home", f"{when} the experiment: {brief(way)}") for when, way in s["homing"].items()),
         ("stage", s["stage"] != "full" and f"{s['stage']}, at most {s['limit']:g} A"),
@@ -69,24 +69,24 @@ def brief(s: Document) -> str:
     if s["result"] != DONE:
         return ", ".join(filter(None, (f"{s['result']}: {s['detail'] or s['cause']}", s["log"])))
     ways = "".join(f", a way home {name}" for name in s["homing"])
-    whole = "" if s["log_complete"] else ", log INCOMPLETE"
+    incomplete = "" if s["log_complete"] else ", log INCOMPLETE"
     where = "home" if s["home"] else "not home"
-    return f"done: {s['answered']} of {s['steps']} answered, {where}{ways}, {s['log']}{whole}"
+    return f"done: {s['answered']} of {s['steps']} answered, {where}{ways}, {s['log']}{incomplete}"
 
 
 def listen_text(s: Document, checks: Sequence[Check]) -> str:
     """The document of ``--read-only`` as text, with its pre-flight."""
-    heard = s["heard"]
+    bus = s["heard"]
     lines = [
         f"a run could NOT begin ({s['result']}): {s['detail']}" if s["detail"] else "a run could begin",
         table(checks),
-        f"  listened for {heard['duration']:.3f} s",
+        f"  listened for {bus['duration']:.3f} s",
     ]
-    for name, count in heard["frames"].items():
-        rejected, rate = sum(heard["rejections"].get(name, {}).values()), heard["rates"].get(name, 0.0)
+    for name, count in bus["frames"].items():
+        rejected, rate = sum(bus["rejections"].get(name, {}).values()), bus["rates"].get(name, 0.0)
         lines.append(f"    {name:<13} {count:8} frames, {rate:7.1f} per second, {rejected} rejected")
-    if heard["others"]:
-        lines.append(f"    others        {heard['others']:8} frames")
+    if bus["others"]:
+        lines.append(f"    others        {bus['others']:8} frames")
     lines.append(f"  log       {s['log']} ({s['log_messages']} messages{_missing(s)})")
     return "\n".join(lines)
 

@@ -111,7 +111,7 @@ class Sensors:
     observer_bandwidth: Bandwidth | None = None
     """Least bandwidth of an observer of second order with a damping from 0.7 to 1 [rad/s]"""
     velocity_lag: Lag | None = None
-    """Longest lag of an observer of which nothing else is known [s]"""
+    """Longest lag of any other observer [s]"""
 
     @property
     def bandwidth(self) -> float | None:
@@ -139,7 +139,7 @@ class Timing:
 
     @property
     def sample_time_ns(self) -> int:
-        """The sample time in whole nanoseconds."""
+        """The sample time in nanoseconds."""
         return round(self.sample_time * 1e9)
 
     @property
@@ -205,7 +205,7 @@ class Node:
 class Can:
     """The bus."""
 
-    bitrate: Bitrate  # Of the bus that the node is on; a mapped drive's own has its mapping file [bit/s]
+    bitrate: Bitrate  # Of the node's bus; that of a mapped drive is in its mapping file [bit/s]
     mapping: Annotated[str, Meta(pattern="^[0-9a-f]{64}$", description="a SHA-256, 64 digits in lower case")] = ""
     """SHA-256 of the mapping of a drive, and its DBC: no other one is taken then. Empty where the file names none."""
 
@@ -223,7 +223,7 @@ class SensorErrors:
 
 @dataclass(frozen=True)
 class SharedErrors(SensorErrors):
-    """And errors of what is known beforehand, which no record determines: each adds to the totals with its prior."""
+    """And errors that no record determines: each adds to the totals with its prior."""
 
     k_m: Positive | None = None  # Relative error of k_m in [brake], where it was measured; J is then estimated
     inertia: NotNegative = 0.01  # Relative error of J, which all four parameters share
@@ -237,7 +237,7 @@ class SharedErrors(SensorErrors):
 class Systematic(SharedErrors):
     """Systematic errors that a bench cannot exclude by itself: ``[systematic]``; last, effects that the plant lacks.
 
-    Standard deviations of Gaussian priors with mean zero, or with what the plant itself says. 0 excludes an error.
+    Standard deviations of Gaussian priors, with mean zero or the plant's value. 0 excludes an error.
     """
 
     quadratic: NotNegative = 1e-4  # Quadratic share of the stiffness that the plant lacks [1/rad]
@@ -288,7 +288,7 @@ class _Document(_Tables):
 
 @dataclass(frozen=True, kw_only=True)
 class Bench(_Tables):
-    """Everything that is known about one bench."""
+    """One bench: its file as records."""
 
     ranges: Mapping[str, Ranges]
     prior: str  # Name of the set of ranges that the running estimate begins with; the shield's where none is named
@@ -305,9 +305,9 @@ class Bench(_Tables):
         except KeyError:
             if name == "nominal":
                 return Ranges(name, self.brake, self.brake)
-            known = ", ".join(sorted(self.ranges))
+            names = ", ".join(sorted(self.ranges))
             raise BenchFileError(
-                f"no set of ranges is called '{name}'; this bench has: {known}{near(name, self.ranges)}"
+                f"no set of ranges is called '{name}'; this bench has: {names}{near(name, self.ranges)}"
             ) from None
 
     def refuse_long_timeouts(self) -> None:
@@ -354,7 +354,7 @@ def load_bench(path: str | Path | None = None) -> Bench:
     """Read a bench file; without a path, the shipped one.
 
     Raises:
-        BenchFileError: the file cannot be read, or says something unknown, of the wrong type, not finite,
+        BenchFileError: the file cannot be read, or a key is unknown, of the wrong type, not finite,
             beyond a ceiling, or contradictory. The message has the file, the key and the reason.
     """
     return parse_bench(*read_bench_text(path))
@@ -432,8 +432,8 @@ def _limit_problems(bench: Bench, driven: bool) -> Iterator[tuple[str, str]]:
     for p in (bench.brake, *(entry.high for entry in bench.ranges.values())):
         lasts = 1.0 / max(p.f_v / p.J, math.sqrt(p.gamma / p.J) * math.sqrt(p.k_1))
         if lasts < shortest:  # simulating it would take for ever: some number has another unit
-            wanted = f"expected J/f_v and sqrt(J/(gamma k_1)) of at least {shortest:g} s in all ranges"
-            yield "brake", f"{wanted}, got {lasts:g} s"
+            expected = f"expected J/f_v and sqrt(J/(gamma k_1)) of at least {shortest:g} s in all ranges"
+            yield "brake", f"{expected}, got {lasts:g} s"
 
 
 def _sensor_problems(sensors: Sensors) -> Iterator[tuple[str, str]]:
@@ -442,8 +442,8 @@ def _sensor_problems(sensors: Sensors) -> Iterator[tuple[str, str]]:
     if sensors.velocity == "sensor":
         yield from ((f"sensors.{key}", 'goes with velocity = "observer"') for key in given)
     elif not given:
-        wanted = "observer_bandwidth in rad/s, its least, or velocity_lag in s, its longest"
-        yield "sensors", f'velocity = "observer" needs {wanted}'
+        needed = "observer_bandwidth in rad/s, its least, or velocity_lag in s, its longest"
+        yield "sensors", f'velocity = "observer" needs {needed}'
     elif len(given) == 2:
         yield "sensors.velocity_lag", "does not go with observer_bandwidth: expected one of the two"
 

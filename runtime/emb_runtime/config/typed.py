@@ -105,7 +105,7 @@ def shown(value: object) -> str:
     """A foreign value for a message: printable ASCII in one line, shortened."""
     try:
         text = ascii(value)
-    except ValueError:  # a whole number of more digits than Python turns into text
+    except ValueError:  # an integer of more digits than Python turns into text
         return "a number of too many digits"
     return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 3]}..."
 
@@ -147,8 +147,8 @@ class _Reader:
     def _record(self, value: dict[str, Any], kind: Any, fields: dict[str, tuple[Any, bool]], keys: Keys) -> Any:
         for key in value:
             if key not in fields:
-                known = f"{', '.join(sorted(fields))}{near(key, fields)}"
-                raise _RefusedError((*keys, key), f"unknown key; expected some of {known}")
+                names = f"{', '.join(sorted(fields))}{near(key, fields)}"
+                raise _RefusedError((*keys, key), f"unknown key; expected some of {names}")
         self.missing += [((*keys, n), hint) for n, (hint, required) in fields.items() if required and n not in value]
         converted = {key: self.convert(inner, fields[key][0], (*keys, key)) for key, inner in value.items()}
         if self.missing:
@@ -162,7 +162,7 @@ class _Reader:
         try:
             return cast("str", msgspec.convert(key, kind))
         except msgspec.ValidationError:
-            expected = _wanted(inspect.type_info(kind))
+            expected = _expected(inspect.type_info(kind))
             raise _RefusedError((*keys, key), f"unknown key; expected {expected}") from None
 
     def _list(self, value: list[Any], kind: Any, kinds: tuple[Any, ...], keys: Keys) -> Any:
@@ -204,7 +204,7 @@ def _by_msgspec(value: object, kind: Any, keys: Keys) -> Any:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError:
         info = inspect.type_info(kind)
-        raise _RefusedError(keys, f"expected {_wanted(info)}, got {_got(value, info)}") from None
+        raise _RefusedError(keys, f"expected {_expected(info)}, got {_got(value, info)}") from None
 
 
 _KINDS: Mapping[type, tuple[str, tuple[str, ...]]] = {
@@ -222,13 +222,13 @@ def _got(value: object, kind: inspect.Type) -> str:
         return str(value).lower()  # as the file has it
     noun, words = _KINDS.get(type(value), ("", ()))
     literal = isinstance(kind, inspect.LiteralType) and type(value) in map(type, kind.values)
-    return f"{'' if literal or any(word in _wanted(kind) for word in words) else noun}{shown(value)}"
+    return f"{'' if literal or any(word in _expected(kind) for word in words) else noun}{shown(value)}"
 
 
 def _missing(missing: list[tuple[Keys, Any]], remedy: str) -> str:
     names = ", ".join(key_text(keys) for keys, _ in missing)
-    wanted = f": expected {_wanted(inspect.type_info(missing[0][1]))}" if len(missing) == 1 else ""
-    return f"{names}: missing{wanted}; {remedy}"
+    expected = f": expected {_expected(inspect.type_info(missing[0][1]))}" if len(missing) == 1 else ""
+    return f"{names}: missing{expected}; {remedy}"
 
 
 def _is_number(kind: inspect.Type) -> bool:
@@ -246,12 +246,12 @@ _NOUNS: Mapping[type, str] = {
 }
 
 
-def _wanted(kind: inspect.Type) -> str:
+def _expected(kind: inspect.Type) -> str:
     """A type in words."""
     if isinstance(kind, inspect.Metadata):
-        return str((kind.extra_json_schema or {}).get("description") or _wanted(kind.type))
+        return str((kind.extra_json_schema or {}).get("description") or _expected(kind.type))
     if isinstance(kind, inspect.UnionType):
-        return " or ".join(_wanted(member) for member in kind.types if not isinstance(member, inspect.NoneType))
+        return " or ".join(_expected(member) for member in kind.types if not isinstance(member, inspect.NoneType))
     if isinstance(kind, inspect.LiteralType):
         return f"{'one of ' if len(kind.values) > 1 else ''}{', '.join(map(str, kind.values))}"
     if isinstance(kind, inspect.FloatType):
@@ -259,7 +259,7 @@ def _wanted(kind: inspect.Type) -> str:
     if isinstance(kind, inspect.IntType):
         return f"a whole number{_bounds(kind)}"
     if isinstance(kind, inspect.TupleType):
-        return f"[{', '.join(_wanted(item) for item in kind.item_types)}]"
+        return f"[{', '.join(_expected(item) for item in kind.item_types)}]"
     if isinstance(kind, inspect.ListType | inspect.VarTupleType):
         least, most = kind.min_length or 0, kind.max_length
         return f"a list of {least} to {most} entries" if most is not None else f"a list of at least {least} entries"

@@ -87,7 +87,7 @@ class Core:
 
     @property
     def at_rest(self) -> bool:
-        """Returns True if the node has come to rest after the stop frames, and its status says why it stopped."""
+        """Returns True if the node has come to rest after the stop frames, and its status has the stop's reason."""
         rests = self._stopping is not None and self._stopping.rests
         return rests and self._reception.stop_reason is not None
 
@@ -119,8 +119,8 @@ class Core:
         """Process the frames of one read at a monotonic time [ns]; :meth:`answer` comes next."""
         memory, self._decision = self._memory, None
         memory.read_ns = now_ns
-        for left, frame in enumerate(frames, 1 - len(frames)):
-            memory.records.append(tuple.__new__(FrameRecord, (frame, now_ns if left == 0 else 0)))
+        for at, frame in enumerate(frames, 1 - len(frames)):
+            memory.records.append(tuple.__new__(FrameRecord, (frame, now_ns if at == 0 else 0)))
             try:
                 if self.state is not OVER:
                     self._process_frame(frame)
@@ -152,8 +152,8 @@ class Core:
         memory.records.append(tuple.__new__(InputRecord, (now_ns, ANSWER, 0, "", "")))
         in_time = now_ns - sample.receive_time_ns <= self._latest_answer_ns  # else the sample is stale
         if not in_time or not self._may_answer(now_ns) or math.isnan(decision.current):
-            left = decision.reasons & Reason.LEFT if in_time else 0
-            memory.unanswered(sample, memory.missed, now_ns, left)
+            reasons = decision.reasons & Reason.LEFT if in_time else 0
+            memory.unanswered(sample, memory.missed, now_ns, reasons)
             self._end_cycle(sample)
             return None
         encode, guard = self.setup.layout.encode_command, self.guard
@@ -164,8 +164,8 @@ class Core:
     def sent(self, now_ns: int, lost: str = "") -> None:
         """Record the cycle of a command that was handed to the bus at a monotonic time [ns].
 
-        Where the bus had no room for it, ``lost`` says so, and the time is that of the decision: sent later, it would
-        answer an old sample.
+        Where the bus had no room for it, ``lost`` has the error, and the time is that of the decision: sent later, it
+        would answer an old sample.
         """
         memory, at = self._memory, self._answer_at
         sample = memory.newest
@@ -190,7 +190,7 @@ class Core:
             self._fail(stop, now_ns)
 
     def latch(self, fault: Fault, now_ns: int) -> None:
-        """Latch a fault of the driver; :meth:`explain` records it, where it was raised once a stop frame has left."""
+        """Latch a fault of the driver; :meth:`explain` records it, where it was raised after a stop frame."""
         self._record_call(Call.LATCH, now_ns, fault.name)
         self._machine.latch(fault, now_ns)
         self._follow_state()

@@ -30,7 +30,7 @@ STOP_LISTEN_NS: Final = 1_500_000_000
 """Longest time that the node may take to come to rest after the stop frames [ns]: a mapped one has a second, and then
 lets its drive go."""
 MOST_FRAMES: Final = 64  # Of one read: a babbling node must not hold the loop
-STOP_FRAME_NOT_SENT: Final = "STOP_FRAME_NOT_SENT"  # Code of the event that says so
+STOP_FRAME_NOT_SENT: Final = "STOP_FRAME_NOT_SENT"  # Code of its event
 HELD_RECORDS: Final = 4  # Without a command fewer records are not passed on yet: not between a pair's two frames
 
 
@@ -162,7 +162,7 @@ class Loop:
             core.explain(self._fault, self._now_ns, detail_of(self._cause))
         self._record()
         for sent in range(1, frames + 1):
-            # Each in a period of its own: what stood in the way of one may be gone for the next.
+            # One in each period: what stood in the way of one may be gone for the next.
             self._listen(self._now_ns + self._period_ns)
             if sent < frames:
                 self._send_stop_frame()
@@ -220,7 +220,7 @@ class Loop:
             self._attempt("RECORD_FAILED", self._push_records)
 
     def _has_tripped(self) -> bool:
-        """Returns True if the watchdog has tripped; False if it cannot be asked."""
+        """Returns True if the watchdog has tripped; False if it cannot be read."""
         try:
             return self.pulse.tripped
         except BaseException as err:
@@ -238,9 +238,9 @@ def fault_of(err: BaseException) -> Fault:
     kind = type(err)
     if issubclass(kind, StopError):
         return cast("StopError", err).fault
-    known = (GuardRejectedError, Fault.GUARD_REJECTED), (PolicyRefusedError, Fault.POLICY_NOT_FINITE)
+    errors = (GuardRejectedError, Fault.GUARD_REJECTED), (PolicyRefusedError, Fault.POLICY_NOT_FINITE)
     return next(
-        (fault for error, fault in (*known, (BusError, Fault.BUS_LOST)) if issubclass(kind, error)), Fault.INTERNAL
+        (fault for error, fault in (*errors, (BusError, Fault.BUS_LOST)) if issubclass(kind, error)), Fault.INTERNAL
     )
 
 

@@ -30,7 +30,7 @@ class Interval(NamedTuple):
 
     elapsed: float  # By the device's clock [s]
     command: float  # That answered the sample before; 0 if none was sent [A]
-    obeyed: bool  # True if the node says that this command acted
+    obeyed: bool  # True if the node reports that this command acted
     follows: bool  # True if nothing is missing between the two samples either
 
 
@@ -42,7 +42,7 @@ class RunCounters:
     answered: int = 0  # Pairs answered by a command
     unanswered: int = 0  # Pairs that got none: overtaken by a newer one, or nothing could or might be sent
     missed: int = 0  # Sampling periods without a valid pair
-    not_obeyed: int = 0  # Commands that came too late for their period, by the node's own account
+    not_obeyed: int = 0  # Commands that came too late for their period, by the node's account
     not_taken: int = 0  # Commands that the interface had no room for; they count as unanswered
     confirmed: int = 0  # Frames of ours whose echo came back: they were on the bus
     rejected: int = 0  # Frames rejected by the reception
@@ -51,7 +51,7 @@ class RunCounters:
     clipped: int = 0
     limited: int = 0  # Commands changed to keep the brake inside its limits
     returning: int = 0  # Commands that the shield took over to be home in time
-    left: int = 0  # Periods left to the node: what had to be sent lay beyond what may be sent
+    left: int = 0  # Periods in which the node brakes: what had to be sent lay beyond what may be sent
     angle_min: float = 0.0
     angle_max: float = 0.0
     top_speed: float = 0.0
@@ -96,7 +96,7 @@ class Memory:
         self.skipped = 0  # Samples that the node's counter has skipped, and its device time has not
         self.lost = LeakyCount(bench.watch.stop_missed)  # Periods without a valid pair
         self.unobeyed = LeakyCount(bench.watch.stop_missed)  # Periods in which the node obeyed no command
-        self.past = NO_PAST  # Last own commands, newest first [A]
+        self.past = NO_PAST  # Last commands, newest first [A]
         self._decision: Decision | None = None  # for the newest sample, not sent yet
         self._command = NO_COMMAND  # the last one that was decided
         self._answered = False  # it was sent, and answers the newest sample
@@ -120,7 +120,7 @@ class Memory:
         self.counters.pairs = 1
 
     def step_of(self, sample: SensorSample) -> int:
-        """Index of a sample on the run's grid, by the node's own clock."""
+        """Index of a sample on the run's grid, by the node's clock."""
         return round((sample.device_time_ns - self.start_ns) / self.period_ns)
 
     def is_next(self, before: SensorSample | None, sample: SensorSample) -> bool:
@@ -190,7 +190,7 @@ class Memory:
         """Count and record a sample for which nothing is sent: the node brakes in its period.
 
         With ``reasons`` it does so because the core decided that. The caller gives the periods missed before it: the
-        memory's own are those before the newest sample, which may have overtaken this one.
+        memory's are those before the newest sample, which may have overtaken this one.
         """
         self._remember(0.0)
         self.counters.unanswered += 1

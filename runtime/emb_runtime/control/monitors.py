@@ -117,9 +117,9 @@ class Node:
         """
         before, self._active_then = self._active_then, self._was_active
         if status.node_state in UNFIT:
-            raise StopError(Fault.NODE_STOPPED, f"the node's status says {status.node_state.name}")
+            raise StopError(Fault.NODE_STOPPED, f"the node's status is {status.node_state.name}")
         idle = before and status.node_state is IDLE
-        return "the node's status says IDLE while its pairs say ACTIVE" if idle else ""
+        return "the node's status is IDLE while its pairs report ACTIVE" if idle else ""
 
 
 class Sensors:

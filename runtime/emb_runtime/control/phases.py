@@ -23,7 +23,7 @@ from emb_runtime.safety.shield_design import late_step
 from emb_runtime.safety.state_machine import Event, Fault, StopError, may_enable
 
 HOME_PAIRS: Final = 50  # Valid pairs in a row, at home, that end a way home
-UNSTEADY: Final = "its samples come earlier and earlier by its own clock: they had piled up, or that clock is fast"
+UNSTEADY: Final = "its samples come earlier and earlier by its clock: they had piled up, or that clock is fast"
 """Reason why a node is not ready."""
 SILENT_WAIT: Final = 10  # Periods after which a driver that waits for the node asks again for the operator's wish
 COVERAGE: Final = 0.8
@@ -136,7 +136,7 @@ class Control(Phase):
         if sample is None:
             return None
         setup, memory, estimate = self.setup, self.memory, self.setup.estimate
-        # Before its device time says which step it is, or that it is the last one. A stamp may be just ahead of now.
+        # Before its device time tells its step, which may be the last one. A stamp may be just ahead of now.
         setup.guard.check_time(sample, max(memory.read_ns, sample.receive_time_ns))
         if self.machine.run.state is ARMED:
             self._begin(sample)
@@ -175,9 +175,9 @@ class Control(Phase):
         return step >= self.setup.law.steps or self._at_home >= HOME_PAIRS
 
     def _check_sensors(self, sample: SensorSample) -> Control:
-        """Coast if the sign is not known to be right and friction alone can stop the brake.
+        """Coast if the sign may be wrong and friction alone can stop the brake.
 
-        With a wrong sign the node's own stop would drive it on.
+        With a wrong sign the node's stop would drive it on.
         """
         sensors = self.setup.sensors
         try:
@@ -194,20 +194,20 @@ class Control(Phase):
     def _command(self, sample: SensorSample, requested: float, step: int) -> Decision:
         """Command for a sample, in the shield's view of time: on the way home the end is always near."""
         setup, memory, sensors, limits = self.setup, self.memory, self.setup.sensors, self.setup.command_limits
-        last, returns, wanted = memory.slew_reference(sample), setup.estimate.goal_ns is not None, requested
+        last, returns, current = memory.slew_reference(sample), setup.estimate.goal_ns is not None, requested
         if setup.homing:
             step = self._late_step
         elif returns:
-            step, wanted = max(step, self._late_step), 0.0
+            step, current = max(step, self._late_step), 0.0
         if (most := sensors.monitor.largest_current(limits.current)) < limits.current:
             limits = limits._replace(current=max(most, abs(last) - limits.slew))  # down to it as fast as may be
-        decision = decide(sensors.law, limits, sample.angle, sample.velocity, wanted, memory.past, last, step)
+        decision = decide(sensors.law, limits, sample.angle, sample.velocity, current, memory.past, last, step)
         if returns:
             return decision._replace(requested=requested, reasons=decision.reasons | Reason.RETURNING)
         return decision
 
     def _finish(self, sample: SensorSample, step: int) -> None:
-        """Check the whole run at its last sample."""
+        """Check at its last sample that the run is complete."""
         setup, memory = self.setup, self.memory
         memory.record(sample, step, 0, memory.missed)
         if setup.homing and self._at_home < HOME_PAIRS:
@@ -239,7 +239,7 @@ class Coasting(Control):
     def __init__(self, setup: Setup, stop: StopError, time: float) -> None:
         super().__init__(setup)
         self._stop = stop
-        self._time = time  # that is left [s]
+        self._time = time  # until friction has stopped it [s]
 
     def _check_sensors(self, sample: SensorSample) -> Control:
         """End the run once the brake has been stopped."""
@@ -264,16 +264,16 @@ class Stopping(Phase):
     def __init__(self, setup: Setup, end: SensorSample | None) -> None:
         super().__init__(setup)
         self.end = end  # The newest sample before; None of a run that never armed
-        self.rests = False  # The newest sample since then says idle
-        self._left = False  # the node has left ACTIVE since then
+        self.rests = False  # The newest sample since then reports idle
+        self._has_stopped = False  # the node was not ACTIVE in a sample since then
         self._samples: list[SensorSample] = []  # the last ones since then
 
     def process_sample(self, sample: SensorSample) -> Phase:
-        """Store the newest samples, and whether the node has left ACTIVE."""
+        """Store the newest samples, and whether the node was not ACTIVE in one."""
         self.memory.newest = sample  # not added: from the end on no deadline runs
         self.setup.sensors.response.watch(sample)
-        if sample.node_state is not OBEYING and not self._left:
-            self._left = True
+        if sample.node_state is not OBEYING and not self._has_stopped:
+            self._has_stopped = True
             self.setup.reception.status = None  # its reason was that of another stop
         self.rests = sample.node_state is IDLE
         self._samples = [*self._samples[1 - REST_SAMPLES :], sample]

@@ -29,7 +29,7 @@ class Setup:
     actor: Actor
     current_limit: float  # Largest current that the policy's contract allows it to request [A]
     guard: Guard
-    limit: float = CEILING_CURRENT  # A current narrower than the bench's, where the operator asked for one [A]
+    limit: float = CEILING_CURRENT  # A current narrower than the bench's, where the operator gave one [A]
     homing: bool = False  # Begin anywhere, let the shield bring the brake home, and end when it rests there
     stop_condition: StopCondition | None = None  # Precision of the estimate at which the way home begins early
 

@@ -43,7 +43,7 @@ class StartConditions:
         self.layout = layout
         self.bounds = bounds
         self.anywhere = anywhere
-        self.identity = bench_identity(bench.identity_hash)  # once: it is a hash of the whole bench
+        self.identity = bench_identity(bench.identity_hash)  # once: it is a hash of the bench
         """Bench identity that the node's status must report."""
 
     def not_ready(self, status: StatusFrame | None, sample: SensorSample, now_ns: int) -> str:
@@ -51,7 +51,7 @@ class StartConditions:
         if now_ns - sample.receive_time_ns > OLDEST_SAMPLE_PERIODS * self.bench.timing.sample_time_ns:
             return "its samples are read too late, this computer is too slow"  # or catching up with what had piled up
         if status is not None and status.node_state is NodeState.FAULT:
-            return "its status says FAULT"
+            return "its status is FAULT"
         return self.mismatch(status) or self.not_at_rest(sample)
 
     def mismatch(self, status: StatusFrame | None) -> str:

@@ -11,7 +11,7 @@ from emb_runtime.estimator.estimate import NORMAL_95
 from emb_runtime.numbers import in_percent
 
 COUNT = len(PARAMETER_NAMES)  # An estimate has so many values, then their deviations
-REACHED = "KNOWN_ENOUGH"  # Code of the event that says so in the log
+REACHED = "KNOWN_ENOUGH"  # Code of its event in the log
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,1 @@
-"""Drives that speak a protocol of their own: mapping file, translation, second guard, and the node in between."""
+"""Drives that speak another protocol: mapping file, translation, second guard, and the node in between."""

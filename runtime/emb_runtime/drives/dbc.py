@@ -1,6 +1,6 @@
 """Messages of a drive's DBC, found in its text one by one: cantools reads only what a mapping uses, and little of it.
 
-Ranges, units, names of values, comments and attributes are left out, but for the one that marks a CAN FD frame. So what
+Ranges, units, names of values, comments and attributes are ignored, but for the one that marks a CAN FD frame. So what
 a DBC costs is bounded, and nothing depends on the ranges. Pure.
 """
 
@@ -65,10 +65,10 @@ def find_messages(text: str) -> dict[str, MessageText]:
         fault = "" if _NEXT.match(bare, end) else f"unexpected {bare[end : end + 40].strip()!r}"
         if fault and end >= ended:
             raise FrameError(f"DBC: not readable: it ends within the message {name}")
-        said = more.get(identifier, [])
-        ranges = re.findall(r"(\d+)-(\d+)", " ".join(said))
+        extra = more.get(identifier, [])
+        ranges = re.findall(r"(\d+)-(\d+)", " ".join(extra))
         pages = sum(max(int(last) - int(first), 0) + 1 for first, last in ranges)
-        fault = _excess(int(identifier), len(signals) + len(said), pages, name in found) or fault
+        fault = _excess(int(identifier), len(signals) + len(extra), pages, name in found) or fault
         lines = [f"BO_ {identifier} {name}: {length} X"]
         for signal_name, page, start, bits, order, sign, scale, offset in signals[:MOST_STATEMENTS]:
             lines.append(f' SG_ {signal_name} {page} : {start}|{bits}@{order}{sign} ({scale},{offset}) [0|0] "" X')
@@ -78,7 +78,7 @@ def find_messages(text: str) -> dict[str, MessageText]:
             is_fd=identifier in fast,
             multiplexors=len(switches),
             multiplexed=any(page != "M" for page in switches),
-            text="" if fault else "\n".join([*lines, *said]) + "\n",
+            text="" if fault else "\n".join([*lines, *extra]) + "\n",
             fault=fault,
         )
     if not found:
@@ -96,7 +96,7 @@ def _excess(identifier: int, statements: int, pages: int, twice: bool) -> str:
 
 
 def _statements(bare: str) -> dict[str, list[str]]:
-    """Statements that say how signals are read, by the identifier of their message: floats, and ranges of pages."""
+    """Statements on how signals are read, by the identifier of their message: floats, and ranges of pages."""
     found: dict[str, list[str]] = {}
     for keyword, pattern in (("SIG_VALTYPE_", _TYPE), ("SG_MUL_VAL_", _PAGES)):
         statements = list(pattern.finditer(bare))

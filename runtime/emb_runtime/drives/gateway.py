@@ -19,7 +19,7 @@ from emb_runtime.system.clock import Clock
 
 MOST_FRAMES = 64  # Frames of one bus that are taken at once: a babbling bus must not hold up the other
 LISTEN = 0.05  # Least time for which the drive's bus is observed before it is armed [s]
-LONGEST_SILENCE = 5.0  # Time for a drive to be heard before it is armed [s]
+LONGEST_SILENCE = 5.0  # Longest wait for a drive's samples before it is armed [s]
 LINGER = 1.0  # Time for which the node still reports its samples after the drive was let go [s]
 
 
@@ -50,10 +50,10 @@ class Gateway:
         self._node_lost: BusError | None = None
         steps = (*mapping.arm, *mapping.disarm)
         sent = {mapping.command.message} | {constant.message for step in steps for constant in step.frames}
-        heard = mapping.sensor_messages | ({mapping.state.message} if mapping.state else set())
+        received = mapping.sensor_messages | ({mapping.state.message} if mapping.state else set())
         ours, theirs = (
             {(info.extended, info.identifier) for info in map(mapping.messages.__getitem__, names)}
-            for names in (sent, heard)
+            for names in (sent, received)
         )
         self._commands = ours - theirs  # a drive may answer under the identifier of its command
         self._is_commanded = False  # by another node
@@ -66,7 +66,7 @@ class Gateway:
 
         Raises:
             BusError: the drive cannot be armed, or a bus is lost.
-            SafetyStopError: the node let the drive go, but not for the operator; the message says why.
+            SafetyStopError: the node let the drive go, but not for the operator; the message has the reason.
         """
         try:
             self._serve(stop_requested, ready, arms=arms)

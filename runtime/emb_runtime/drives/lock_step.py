@@ -91,7 +91,7 @@ def open_mapped(options: str, bench: Bench) -> tuple[LockStepDrive, Clock]:
     if bus.truth is None:
         bus.close()
         raise UsageError(
-            f"--iface 'map:{options}': a mapped drive on a real bus needs a process of its own: start emb-gateway "
+            f"--iface 'map:{options}': a mapped drive on a real bus needs another process: start emb-gateway "
             f"{file} --drive {iface} --node vcan0, then emb-run --iface vcan0 --drive {file}@{iface}"
         )
     return LockStepDrive(mapping, bench, bus, clock, f"map:{options}"), clock

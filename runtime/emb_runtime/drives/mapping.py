@@ -1,4 +1,4 @@
-"""A drive as its mapping file describes it: what the signals of its own DBC are to a brake, and its fit to a bench.
+"""A drive as its mapping file describes it: what the signals of its DBC are to a brake, and its fit to a bench.
 
 :mod:`emb_runtime.drives.mapping_file` reads the records.
 """
@@ -29,11 +29,11 @@ PROPERTIES = {
     "no_identity": "the drive has no identity on the bus: a wrong drive is not refused",
     "hold_on_loss": "without host or cable the drive holds its last current for its time-out, then switches it off",
     "no_counter": "the sensor messages have no counter: a repeated one is not noticed, nor is a frozen sensor at rest",
-    "no_crc": "the sensor messages have no checksum of their own",
-    "no_command_crc": "the command message has no checksum of its own",
+    "no_crc": "the sensor messages have no checksum",
+    "no_command_crc": "the command message has no checksum",
     "no_current": "the current is not measured: the commanded current is used instead",
     "no_state": "the drive does not report whether it is armed: its time-out cannot be proved",
-    "relative_k_m": "the command is not a current: only the ratio of k_m to per_ampere is known",
+    "relative_k_m": "the command is not a current: only the ratio of k_m to per_ampere can be estimated",
 }
 """Properties that a drive may lack, and what is lost with each. Each must be accepted by name."""
 
@@ -83,13 +83,13 @@ class Commanded:
 
 @dataclass(frozen=True)
 class State:
-    """The signal that says what the drive is doing."""
+    """The signal of the drive's state."""
 
     message: str
     field: Field
     idle: tuple[int, ...]
     active: tuple[int, ...]
-    timeout: float  # Age at which what it said is no longer believed [s]
+    timeout: float  # Age at which a report is no longer believed [s]
     error: Field | None  # Signal of the same message that is 0 where the drive is well
 
 
@@ -146,14 +146,14 @@ class Mapping:
     messages: Dictionary[str, MessageInfo]  # Those that are used, by name
     angle: Measured
     velocity: Measured
-    sensors: Sensors  # Origin of the velocity; a sensor where the file says nothing of it
+    sensors: Sensors  # Origin of the velocity; a sensor where the file has none
     current: Measured | None
     conditions: Dictionary[str, Measured]  # Temperature [degC] and supply voltage [V], by name: nothing acts on them
     command: Commanded
     state: State | None
     arm: tuple[Step, ...]
     disarm: tuple[Step, ...]
-    watchdog: float  # The drive's own time-out [s]
+    watchdog: float  # The drive's time-out [s]
     end_stop_speed: float  # Speed into an end stop that the brake bears [rad/s]: without host or cable nothing stops it
     text: str
     dbc_text: str
@@ -194,7 +194,7 @@ class Mapping:
     def bus_load(self, sample_time: float) -> float:
         """Worst-case share of the drive's bus that a run takes at a sample time [s], 1.0 being all of it.
 
-        Sensor messages and command come each sample; what says the state alone comes as often as it is believed.
+        Sensor messages and command come each sample; a message with the state alone comes once in its time-out.
         """
         each = sum(self.messages[name].worst_bits for name in (*self.sensor_messages, self.command.message))
         load = each / sample_time
@@ -244,19 +244,19 @@ def require_fit(mapping: Mapping, bench: Bench) -> None:
 def _fit_problems(mapping: Mapping, bench: Bench) -> Iterator[tuple[str, str]]:
     """Keys of a mapping that are not enough for a bench, or too long, and why."""
     limits, command = bench.limits, mapping.command
-    wanted_current = -limits.current, limits.current
-    for name, ends, wanted, unit in (
-        ("command", (command.low / command.factor, command.high / command.factor), wanted_current, "A"),
+    currents = -limits.current, limits.current
+    for name, ends, needed, unit in (
+        ("command", (command.low / command.factor, command.high / command.factor), currents, "A"),
         ("angle", mapping.angle.ends, limits.angle, "rad"),
         ("velocity", mapping.velocity.ends, (-limits.velocity, limits.velocity), "rad/s"),
     ):
         low, high = sorted(ends)
-        covers = low <= wanted[0] and wanted[1] <= high
+        covers = low <= needed[0] and needed[1] <= high
         if name == "command":  # as the encoder compares: a quotient may be rounded the other way
-            covers = all(command.low <= current * command.factor <= command.high for current in wanted)
+            covers = all(command.low <= current * command.factor <= command.high for current in needed)
         if not covers:
             covered = f"{low:.4g} to {high:.4g} {unit} does not cover"
-            yield f"can.signals.{name}.range", f"{covered} the bench's {wanted[0]:g} to {wanted[1]:g} {unit}"
+            yield f"can.signals.{name}.range", f"{covered} the bench's {needed[0]:g} to {needed[1]:g} {unit}"
     step = max(map(command.field.step, (command.low, command.high))) / abs(command.factor)
     if not step <= COARSEST_CURRENT:
         yield "can.signals.command", f"a step of {step:.3g} A is too coarse, expected at most {COARSEST_CURRENT:g} A"

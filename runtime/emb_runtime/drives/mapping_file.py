@@ -1,4 +1,4 @@
-"""The mapping file: a drive's own DBC, and what its signals are to a brake, read, checked, and made a :class:`Mapping`.
+"""The mapping file: a drive's DBC, and what its signals are to a brake, read, checked, and made a :class:`Mapping`.
 
 What a drive cannot give is derived here from what the file names, and must be accepted by name in the file.
 """
@@ -165,7 +165,7 @@ class _Node(Struct, kw_only=True):
         float,
         Meta(gt=0, le=LONGEST_NODE_WATCHDOG),
         _says(
-            f"the drive's own time-out, above 0 to {LONGEST_NODE_WATCHDOG:g} s: a drive without one "
+            f"the drive's time-out, above 0 to {LONGEST_NODE_WATCHDOG:g} s: a drive without one "
             "is not commanded, and no key accepts it"
         ),
     ]
@@ -216,8 +216,8 @@ def _made(file: _File, text: str, dbc_text: str, source: str) -> Mapping:
     reader = _Reader(source, messages, can.protection)
     command = reader.command(signals.command)
     state = None if signals.state is None else reader.state(signals.state)
-    known = signals.velocity.observer_bandwidth, signals.velocity.velocity_lag
-    if None not in known:
+    declared = signals.velocity.observer_bandwidth, signals.velocity.velocity_lag
+    if None not in declared:
         reason = "does not go with observer_bandwidth: expected one of the two"
         raise reader.error("can.signals.velocity.velocity_lag", reason)
     made = Mapping(
@@ -228,7 +228,7 @@ def _made(file: _File, text: str, dbc_text: str, source: str) -> Mapping:
         messages=reader.used,
         angle=reader.measured(signals.angle, "can.signals.angle"),
         velocity=reader.measured(signals.velocity, "can.signals.velocity"),
-        sensors=Sensors("sensor" if known == (None, None) else "observer", *known),
+        sensors=Sensors("sensor" if declared == (None, None) else "observer", *declared),
         current=None if signals.current is None else reader.measured(signals.current, "can.signals.current"),
         conditions={
             name: reader.measured(of, f"can.signals.{name}")
@@ -383,8 +383,8 @@ class _Reader:
         message = self._message(name, key)
         found = next((one for one in message.signals if one.name == signal), None)
         if found is None:
-            known = _names({one.name for one in message.signals})
-            raise self.error(key, f"{name} has no signal {shown(signal)}; it has {known}")
+            names = _names({one.name for one in message.signals})
+            raise self.error(key, f"{name} has no signal {shown(signal)}; it has {names}")
         pages = found.multiplexer_ids or []
         if len(pages) > 1:
             raise self.error(key, f"{text}: expected a signal of one value of the multiplexor, it is of {len(pages)}")
@@ -396,8 +396,8 @@ class _Reader:
         name = message.name if page is None else f"{message.name}[{page}]"
         if name in self.used:
             return self.used[name]
-        chosen = [one for one in message.signals if one.multiplexer_ids is None or page in one.multiplexer_ids]
-        fields = {one.name: make_field(one) for one in chosen}
+        signals = [one for one in message.signals if one.multiplexer_ids is None or page in one.multiplexer_ids]
+        fields = {one.name: make_field(one) for one in signals}
         for field in fields.values():
             if field.is_float and field.length not in (16, 32, 64):
                 raise self.error(key, f"{message.name}.{field.name}: expected a float of 16, 32 or 64 bits")
@@ -465,8 +465,8 @@ class _Reader:
         if checksum is None:
             raise self.error(key, "missing: expected the name of a signal; add it")
         first = min(checksum.positions)
-        whole = sorted(checksum.positions) == list(range(first, first + bits))
-        if checksum.length != bits or not whole or first % 8 or checksum.signed or checksum.is_float:
+        aligned = sorted(checksum.positions) == list(range(first, first + bits))
+        if checksum.length != bits or not aligned or first % 8 or checksum.signed or checksum.is_float:
             raise self.error(key, f"expected an unsigned signal of {bits} bits that begins with a byte")
 
 

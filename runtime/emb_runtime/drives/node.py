@@ -3,11 +3,11 @@
 Pure logic: frames of both sides and times go in, frames come out; no clock, no socket. To the loop it is a node like
 any other, see ``emb.dbc``: it obeys a valid, enabled answer to the newest sample, brakes a period that has none, and
 begins a stop after the bench's ``node.watchdog``. To the drive it is the commander: it sends one current for each
-sample, and so feeds the drive's own watchdog only as long as samples come and are answered or braked.
+sample, and so feeds the drive's watchdog only as long as samples come and are answered or braked.
 
-A command acts when it arrives, within the period of its sample, or of the next one where the drive is polled, as
-``shield.frame_age`` of the bench says. Nothing here helps when this computer or the cable is lost: the drive then holds
-its last current for its own time-out, and lets go.
+A command acts when it arrives, within the period of its sample, or of the next one where the drive is polled: see
+``shield.frame_age`` of the bench. Nothing here helps when this computer or the cable is lost: the drive then holds its
+last current for its time-out, and lets go.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from emb_runtime.errors import FrameError, SafetyStopError
 from emb_runtime.records import Frame
 from emb_runtime.safety.shield import damped_current
 
-SILENT_PERIODS = 3  # Periods without a sample after which an armed drive is let go: its speed is not known any more
+SILENT_PERIODS = 3  # Periods without a sample after which an armed drive is let go: its speed is then unknown
 READY_SAMPLES = 10  # Samples of a drive that broadcasts, before it is armed
 MOST_INTRUSIONS = 3  # Commands of another node after which a moving drive is let go: braking against them is no use
 INTRUDED = "another node commands it; end that first, a second gateway maybe"
@@ -34,7 +34,7 @@ INTRUDED = "another node commands it; end that first, a second gateway maybe"
 
 @dataclass
 class Poll:
-    """Exchange with a drive that sends only what it is asked for: each command asks for a sample."""
+    """Exchange with a drive that only answers: each command requests a sample."""
 
     due_ns: int = 0
     is_awaited: bool = False  # The sample has not come yet
@@ -73,7 +73,7 @@ class DriveNode:
 
     @property
     def may_arm(self) -> bool:
-        """True if the drive has sent samples, or sends only what it is asked for."""
+        """True if the drive has sent samples, or only answers."""
         return self._poll is not None or self.answers.samples >= READY_SAMPLES
 
     @property
@@ -97,7 +97,7 @@ class DriveNode:
     def arm(self, now_ns: int) -> None:
         """Begin to arm the drive at a monotonic time [ns]; :attr:`phase` becomes Ready, or Failed.
 
-        Where the drive reports its state, it must let go by its own time-out once before it is armed for good.
+        Where the drive reports its state, it must let go by its time-out once before it is armed for good.
         """
         if isinstance(self.phase, Off):
             self._enter(self.arming)
@@ -170,7 +170,7 @@ class DriveNode:
             self._fail("angle and velocity contradict each other: with them no brake can be stopped")
         self._enter(self.phase.on_sample(sample, self._sensors.is_outside(sample)))
         frames = self.answers.frames(sample, self.outlet.applied(sample), device_ns, self.phase.state, self.stop_reason)
-        # While Arming too: a drive says late that it is armed, and its time-out runs.
+        # While Arming too: a drive reports late that it is armed, and its time-out runs.
         sends = self._poll is None and isinstance(self.phase, Arming | Ready | Stopping)
         if sends and not self._is_silent(sample.time_ns):
             self._send_own(sample.time_ns)
@@ -202,7 +202,7 @@ class DriveNode:
             if not self.answers.missed and isinstance(self.phase, Active):
                 self._miss()
             self._send_own(now_ns)
-        self.times.asked(now_ns)
+        self.times.polled(now_ns)
 
     def _check_drive(self, now_ns: int) -> None:
         """Give the drive up when it reports that it is not armed, or reports nothing."""
@@ -238,7 +238,7 @@ class DriveNode:
             self.arming.fed(now_ns)
 
     def _command(self, current: float) -> bool:
-        """Send a current [A]; returns True if it left. The drive is given up with one that is refused."""
+        """Send a current [A]; returns True if it was sent. One that is refused ends in Failed."""
         try:
             return self.outlet.command(current)
         except (FrameError, SafetyStopError) as refused:

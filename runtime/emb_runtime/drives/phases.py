@@ -4,7 +4,7 @@
     Arming, Ready -> Off when nobody wants the drive any more; Arming, Ready, Active, Stopping -> Failed
 
 Pure, but for Arming, which sends the file's sequence. The node sends nothing in Off and Failed, 0 A while Arming and
-Ready, the host's current while Active, that of its own stop while Stopping. On the way to Off and to Failed it lets the
+Ready, the host's current while Active, that of its stop while Stopping. On the way to Off and to Failed it lets the
 drive go.
 """
 
@@ -69,7 +69,7 @@ class Arming(Phase):
 
     @property
     def time_out(self) -> str:
-        """Proof of the drive's own time-out, in words."""
+        """Proof of the drive's time-out, in words."""
         if self._proof is not None and self._proof.done:
             return f"disarmed within {self._proof.seen_ns * 1e-9:.3f} s without a command"
         if self._mapping.state is None:
@@ -78,7 +78,7 @@ class Arming(Phase):
 
     @property
     def asks_ns(self) -> int | None:
-        """Time at which a polled drive is asked after a silence [ns]; None if there is none."""
+        """Time of the poll after a silence [ns]; None if there is none."""
         return None if self._proof is None else self._proof.asks_ns
 
     def begin(self, now_ns: int) -> Phase:
@@ -98,7 +98,7 @@ class Arming(Phase):
     def on_report(self, state: DriveState, time_ns: int) -> None:
         """The drive has reported its state, by a message that came at this time [ns]."""
         if self._proof is not None and not self._steps:
-            self._proof.take(state, time_ns)
+            self._proof.add_report(state, time_ns)
 
     def on_time(self, now_ns: int, state: DriveState) -> Phase:
         """Send what is due; a state that does not come in time is a failure."""

@@ -21,17 +21,17 @@ class SampleTimes:
     """Times of one drive's samples, which it does not stamp, and of their answers."""
 
     def __init__(self, mapping: Mapping, bench: Bench) -> None:
-        self._polled = mapping.polled
+        self._is_polled = mapping.polled
         self._frame_age = bench.shield.frame_age
         self._period_ns = bench.timing.sample_time_ns
         bits = max(mapping.messages[name].worst_bits for name in mapping.sensor_messages)
         bits += mapping.messages[mapping.command.message].worst_bits
         self._bus_ns = 0 if mapping.polled else round(bits / mapping.bitrate * 1e9)
         self._grid_ns: float | None = None
-        self._first_ns = self._asked_ns = self._measured_ns = 0
+        self._first_ns = self._polled_ns = self._measured_ns = 0
         self.largest_age_ns = 0
         """Longest time from a measurement until its answer acted, as far as this computer sees it [ns]: since the poll
-        that asked for it; else since its place on the grid, and the frames' own time on the bus."""
+        that requested it; else since its place on the grid, plus the time of the frames on the bus."""
         self.largest_jitter_ns = 0
         """Largest deviation of a sample's arrival from the grid [ns]."""
 
@@ -47,7 +47,7 @@ class SampleTimes:
         )
 
     def take(self, time_ns: int) -> int:
-        """Take a sample's arrival; gives its time since the first [ns]: on the grid, or its own where it is polled."""
+        """Take a sample's arrival; gives its time since the first [ns]: on the grid, or as it came if polled."""
         if self._grid_ns is None:
             self._grid_ns = float(time_ns)
             self._first_ns = time_ns
@@ -55,15 +55,15 @@ class SampleTimes:
             periods = max(1, round((time_ns - self._grid_ns) / self._period_ns))
             expected_ns = self._grid_ns + periods * self._period_ns
             late_ns = time_ns - expected_ns
-            # Who is asked answers at once: its samples have no grid of their own.
-            self._grid_ns = float(time_ns) if self._polled else expected_ns + GRID_GAIN * late_ns
+            # A polled drive answers at once: its samples are on the grid of the polls.
+            self._grid_ns = float(time_ns) if self._is_polled else expected_ns + GRID_GAIN * late_ns
             self.largest_jitter_ns = max(self.largest_jitter_ns, round(abs(late_ns)))
-        self._measured_ns = self._asked_ns if self._polled else min(time_ns, round(self._grid_ns))
+        self._measured_ns = self._polled_ns if self._is_polled else min(time_ns, round(self._grid_ns))
         return round(self._grid_ns) - self._first_ns + self._period_ns
 
-    def asked(self, now_ns: int) -> None:
+    def polled(self, now_ns: int) -> None:
         """Note a poll [ns]: the next sample is its answer."""
-        self._asked_ns = now_ns
+        self._polled_ns = now_ns
 
     def acted(self, now_ns: int) -> None:
         """Note that the answer to the newest sample leaves [ns]."""

@@ -82,7 +82,7 @@ def make_field(signal: DbcSignal) -> Field:
 
 
 def raw_value(field: Field, data: bytes) -> int:
-    """The signal's bits as a whole number, sign included; of a float, its bit pattern. IndexError: too few bytes."""
+    """The signal's bits as an integer, sign included; of a float, its bit pattern. IndexError: too few bytes."""
     raw = 0
     for position in field.positions:
         raw = raw << 1 | data[position >> 3] >> (position & 7) & 1
@@ -92,13 +92,13 @@ def raw_value(field: Field, data: bytes) -> int:
 
 
 def physical_value(field: Field, data: bytes) -> float:
-    """The signal's value [DBC units]; NaN and infinity where a float says so. IndexError: too few bytes."""
+    """The signal's value [DBC units]; NaN and infinity where a float is that. IndexError: too few bytes."""
     raw = raw_value(field, data)
     value = struct.unpack(_FLOATS[field.length], raw.to_bytes(field.length // 8, "big"))[0] if field.is_float else raw
     return float(value * field.scale + field.offset)
 
 
-MODULI = {"profile1": 15, "profile2": 16, "profile5": 256}  # Number of values of the counter, where the profile says so
+MODULI = {"profile1": 15, "profile2": 16, "profile5": 256}  # Number of values of the counter, where the profile has one
 DATA_IDS = {"profile1": 1, "profile2": 16, "profile5": 1}
 """Number of data ids of a message: profile 2 has one for each value of the counter."""
 
@@ -108,7 +108,7 @@ class Protection:
     """Protection of one message."""
 
     kind: str  # That of the mapping file's can.protection
-    checksum: Field | None = None  # Whole bytes: one, or two with profile 5
+    checksum: Field | None = None  # One byte, or two with profile 5
     counter: Field | None = None
     modulus: int = 0  # Number of values of the counter, 0 where there is none
     data_ids: tuple[int, ...] = ()

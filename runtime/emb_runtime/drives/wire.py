@@ -20,9 +20,9 @@ from emb_runtime.records import Frame
 
 
 class DriveState(StrEnum):
-    """State of the drive, as far as it says one."""
+    """State of the drive, as far as it reports one."""
 
-    UNKNOWN = "unknown"  # It has said nothing yet, or what it said is too old
+    UNKNOWN = "unknown"  # It has reported nothing yet, or its last report is too old
     IDLE = "idle"
     ACTIVE = "active"
     FAULT = "fault"  # It reports an error, or a state that the file does not name
@@ -91,7 +91,7 @@ class Outlet:
         """Largest current of the latest run [A]."""
 
     def command(self, current: float) -> bool:
-        """Send a current [A]; returns True if it left. One that is refused raises FrameError or WireGuardError."""
+        """Send a current [A]; returns True if it was sent. One that is refused raises FrameError or WireGuardError."""
         try:
             carried = self.guard.command(self._encoder.command(current), current)
         except TransmitQueueFullError:
@@ -146,7 +146,7 @@ class Receiver:
         """Number of frames that were not believed, by reason."""
         self.refusal = ""
         """Latest frame that was not believed, with what it had and what it should have; empty if all were."""
-        self.reported = ""  # What the latest message with the state says, and what it should
+        self.reported = ""  # State in the latest message, and the expected ones
 
     @property
     def frames_missing(self) -> str:
@@ -178,7 +178,7 @@ class Receiver:
     def _believed(self, info: MessageInfo, frame: Frame) -> dict[str, float] | None:
         """Values of a frame, None if it is not to be believed."""
         if frame.remote or len(frame.data) != info.length:
-            lengths = f"{len(frame.data)} bytes came, the DBC says {info.length}"
+            lengths = f"{len(frame.data)} bytes came, the DBC has {info.length}"
             self._reject("wrong length", f"{info.name}: wrong length: {lengths}")
             return None
         if why := info.protection.fault(frame.data):
@@ -214,8 +214,8 @@ class Receiver:
         state = self._mapping.state
         assert state is not None
         value = values[state.field.name]
-        known = f"idle is {', '.join(map(str, state.idle))}, active {', '.join(map(str, state.active))}"
-        self.reported = f"{state.message}.{state.field.name} is {value:.0f}; {known}"
+        named = f"idle is {', '.join(map(str, state.idle))}, active {', '.join(map(str, state.active))}"
+        self.reported = f"{state.message}.{state.field.name} is {value:.0f}; {named}"
         if state.error is not None and values[state.error.name] != 0.0:
             self.last_state = DriveState.FAULT
             self.reported = f"{state.message}.{state.error.name} is {values[state.error.name]:.0f}, not 0"
@@ -259,8 +259,8 @@ def conditions_in(mapping: Mapping, frame: Frame) -> dict[str, float]:
         info = mapping.messages[one.message]
         if (frame.identifier, frame.extended, frame.own, frame.error) != (info.identifier, info.extended, False, False):
             continue
-        is_whole = not frame.remote and len(frame.data) == info.length and not info.protection.fault(frame.data)
-        if is_whole and _is_of(info, frame):
+        is_complete = not frame.remote and len(frame.data) == info.length and not info.protection.fault(frame.data)
+        if is_complete and _is_of(info, frame):
             value = physical_value(one.field, frame.data)
             if one.low <= value <= one.high:  # this way round, NaN is none
                 found[name] = one.si(value)
@@ -269,5 +269,5 @@ def conditions_in(mapping: Mapping, frame: Frame) -> dict[str, float]:
 
 def _is_of(info: MessageInfo, frame: Frame) -> bool:
     """True if a frame of the message's identifier has its value of the multiplexor, or is too short to tell."""
-    is_whole = not frame.remote and len(frame.data) == info.length
-    return info.page is None or not is_whole or raw_value(info.page, frame.data) == info.page_value
+    is_complete = not frame.remote and len(frame.data) == info.length
+    return info.page is None or not is_complete or raw_value(info.page, frame.data) == info.page_value

@@ -101,7 +101,7 @@ class WireGuard:
     def _check_value(self, field: Field, data: bytes, meant: float) -> None:
         value = physical_value(field, data)
         if not _says(value, meant, field.step(value)):
-            raise self._refused(f"{field.name} says {value:g}, meant was {meant:g}")
+            raise self._refused(f"{field.name} is {value:g}, expected {meant:g}")
 
     def _check_unused(self, data: bytes, info: MessageInfo) -> None:
         """Refuse a bit that no signal covers."""

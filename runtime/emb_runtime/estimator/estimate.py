@@ -1,7 +1,8 @@
 """An estimate as plain data by name, and in words.
 
 Every uncertainty has one of two names; both are half of a 95 % interval (k = 2). *Repeatability* is the scatter of
-further runs by the sensors' noise, *total* the distance from the true value. A part of the total is known before a run.
+further runs by the sensors' noise, *total* the distance from the true value. A part of the total does not depend on the
+run.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ NORMAL_95 = 1.959963984540054  # Standard deviations that 95 % of a Gaussian lie
 UNITS = {"k_m": "N·m/A", "k_1": "N/rad", "T_c": "N·m", "f_v": "N·m·s/rad"}  # Of the parameters
 SCALED = ("k_m", "T_c")  # Parameters that an error of the angle's scale moves
 DOMINANT = 0.005  # Error of J, a standard deviation, from which on little else is in a total
-UNKNOWN = Systematic(inertia=0.0, angle_scale=0.0, time_scale=0.0)  # Where no bench file says what is known beforehand
+UNKNOWN = Systematic(inertia=0.0, angle_scale=0.0, time_scale=0.0)  # Where there is no bench file
 NO_FIT = "THE MODEL DOES NOT FIT: friction, a delay or a sensor differs from the model"
 
 
-def known_before(errors: Systematic) -> dict[str, float]:
-    """Part of each parameter's total that is known before a run, as a share of the parameter.
+def systematic_part(errors: Systematic) -> dict[str, float]:
+    """Part of each parameter's total that does not depend on the run, as a share of the parameter.
 
     If all torques and J are scaled alike, the motion is the same: each parameter has the relative error of J. An angle
     that is shown too large by some share makes k_m and T_c too large by it, and a current k_m too small. A clock that
@@ -47,13 +48,13 @@ def by_name(numbers: Sequence[float], errors: Systematic) -> dict[str, dict[str,
 
     The ``numbers`` are those of :attr:`emb_runtime.estimator.estimator.Estimator.estimate`.
     """
-    before = known_before(errors)
+    prior = systematic_part(errors)
     return {
         name: {
             "value": value,
             "deviation": deviation,
             "repeatability": NORMAL_95 * deviation,
-            "total": math.hypot(NORMAL_95 * deviation, before[name] * value),
+            "total": math.hypot(NORMAL_95 * deviation, prior[name] * value),
             "unit": UNITS[name],
         }
         for name, value, deviation in zip(PARAMETER_NAMES, numbers, numbers[len(PARAMETER_NAMES) :], strict=False)
@@ -62,12 +63,12 @@ def by_name(numbers: Sequence[float], errors: Systematic) -> dict[str, dict[str,
 
 
 def total(repeatability: Mapping[str, float], errors: Systematic) -> str:
-    """The total in words, from the ``repeatability`` of parameters as shares of them and what is known before a run.
+    """The total in words, from the ``repeatability`` of parameters as shares of them and their :func:`systematic_part`.
 
-    ``total about 2 %, as J is known to 1 %``; empty where nothing is known.
+    ``total about 2 %, as J is known to 1 %``; empty where there is none.
     """
-    before = known_before(errors)
-    shares = [math.hypot(own, before[name]) for name, own in repeatability.items() if math.isfinite(own)]
+    systematic = systematic_part(errors)
+    shares = [math.hypot(share, systematic[name]) for name, share in repeatability.items() if math.isfinite(share)]
     prior, cause = max(
         (errors.inertia, "J"),
         (errors.angle_scale, "the angle's scale"),
@@ -97,8 +98,8 @@ def shares(estimate: Mapping[str, Any]) -> dict[str, float]:
 def words(estimate: Mapping[str, Any], of_total: str, *, fits: bool) -> list[str]:
     """Lines on a :func:`by_name` for a person; ``of_total`` is that of :func:`total`."""
     lines = ["running estimate ± repeatability (95 %, k=2), valid if the model is right"]
-    said = list(rows(estimate))
-    width = max((len(value) for _, value, _ in said), default=0)
+    found = list(rows(estimate))
+    width = max((len(value) for _, value, _ in found), default=0)
     lines += [] if fits else [f"  {NO_FIT}"]
-    lines += [f"  {name} = {value:{width}}   {share}".rstrip() for name, value, share in said]
+    lines += [f"  {name} = {value:{width}}   {share}".rstrip() for name, value, share in found]
     return lines + ([f"  {of_total}"] if fits and of_total else [])

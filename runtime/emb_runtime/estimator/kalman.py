@@ -3,7 +3,7 @@
 It predicts with the brake of eq. 3.12-3.14 and the current that acted, and corrects with the measured angle and then
 with the velocity, which for independent noise is the joint correction (Simon, Optimal State Estimation, 2006, chapters
 6 and 13). The velocity of an observer is a function of the angles and no measurement: there the angle alone corrects.
-The parameters are constant. docs/explanation/runtime.md says why each of the following is as it is.
+The parameters are constant. docs/explanation/runtime.md has the reason for each of the following.
 
 - **Ranges.** The filter's parameters are not bounded: values are cut off at their ranges where they are used.
 - **Gaps.** The current in lost periods is the newest reported one, with an uncertainty of the current limit for each.
@@ -250,9 +250,9 @@ def deviations(model: Model, state: State) -> Four:
 def _deviation(variance: float, beyond: float, width: float, doubted: bool) -> float:
     if variance < 0.0:
         return math.inf
-    known, beyond = math.sqrt(variance), abs(beyond)
-    known = beyond if beyond > known else known
-    return max(known, width / math.sqrt(12.0)) if doubted else known
+    deviation, beyond = math.sqrt(variance), abs(beyond)
+    deviation = beyond if beyond > deviation else deviation
+    return max(deviation, width / math.sqrt(12.0)) if doubted else deviation
 
 
 def _product(p: Packed, a: Six) -> Six:

@@ -87,7 +87,7 @@ def slide(now: Accelerations, x: float, v: float, t: float, forward: float) -> t
     e = -now.damping * b - touching * a
     x1 = x + t * (v + t * (a / 2.0 + t * (b / 6.0 + t * e / 24.0)))
     v1 = v + t * (a + t * (b / 2.0 + t * e / 6.0))
-    if x * x1 < 0.0:  # contact is made or left on the way: the spring acts in a part of the period
+    if x * x1 < 0.0:  # contact begins or ends on the way: the spring acts in a part of the period
         v1 -= now.spring * t * x1 * x1 / (2.0 * abs(x1 - x))
     return x1, v1
 
@@ -113,8 +113,8 @@ def move(
     ahead, wide, stops = toward * v, DOUBT * spread_along, forward * v1 < 0.0
     damped = now.damping * t
     full, half = t * (1.0 - 0.5 * damped), t * t * (0.5 - damped / 6.0)
-    started, kept = (ahead + REST) / spread, (ahead + t * driven) / wide
-    first, second = (ahead + t * braked) / spread_against, min(started, kept)
+    at_start, at_end = (ahead + REST) / spread, (ahead + t * driven) / wide
+    first, second = (ahead + t * braked) / spread_against, min(at_start, at_end)
     if not stops and (max(first, second) <= -FARTHEST or min(first, second) >= FARTHEST):  # it slides for certain
         return Motion(x1, v1, t, half, -forward * half, 1.0, full, -forward * full, 0.0, 0.0)
     r = max(driven, 0.0) / braked
@@ -125,7 +125,7 @@ def move(
     if stops:
         v1 *= r  # 0 if it moved in the direction of the pull, which is then too weak
         x1 = x + 0.5 * (v * before + v1 * after)
-    sooner = started < kept
+    sooner = at_start < at_end
     width = spread if sooner else wide
     not_against, along = normal(first), normal(second)
     against = 1.0 - not_against
@@ -170,7 +170,7 @@ def contact(x: float, x1: float, t: float, v: float, v1: float) -> tuple[float, 
 
     Returns:
         Share of the period in contact, and the mean of the squeezed angle as it acts on the velocity and, weighted with
-        the time that is left, on the angle [rad].
+        the rest of the period, on the angle [rad].
     """
     if x * x1 < 0.0:
         share = (max(x1, 0.0) - max(x, 0.0)) / (x1 - x)

@@ -1,7 +1,7 @@
 """The runtime's side of the log: a handle that pushes records into shared memory and never waits.
 
-The file is written by a process of its own (:mod:`emb_runtime.log.recorder_process`), which outlives this one: if the
-runtime is killed, it writes what the ring still holds and closes the file properly.
+Another process writes the file (:mod:`emb_runtime.log.recorder_process`), and outlives this one: if the runtime is
+killed, it writes what the ring still holds and closes the file properly.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from emb_runtime.log.ring_buffer import LogHeader, Record, Ring, pack
 from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child
 
 START_TIMEOUT: Final = 30.0  # Longest wait for the recorder process to have the file on disk [s]
-FINISH_TIMEOUT: Final = 30.0  # Longest wait for it to write what is left and close the file [s]
+FINISH_TIMEOUT: Final = 30.0  # Longest wait for it to empty the ring and close the file [s]
 READ_BACK: Final = 20e6  # Rate at which the slowest disk gives the file back, which takes longer [bytes per second]
 
 
@@ -36,7 +36,7 @@ class RecorderResult(NamedTuple):
 
 
 class _WriterHere:
-    """Writer in this process, where there are none of our own: the time of a simulated run stands still meanwhile."""
+    """Writer in this process, where there are no others: the time of a simulated run stands still meanwhile."""
 
     def __init__(self, ring: Ring, document: Mapping[str, Any]) -> None:
         # By name, because the compiler would follow into it, and with it into libraries that it does not need.
@@ -112,9 +112,9 @@ class Recorder:
     def finish(self, trailer: Mapping[str, str], timeout: float = FINISH_TIMEOUT) -> RecorderResult:
         """Have the rest written and the file closed; ends the process in any case. A failure is in the result.
 
-        The trailer, with what is known after the run, becomes the metadata ``emb.end``.
+        The trailer, the outcome of the run, becomes the metadata ``emb.end``.
         """
-        with contextlib.suppress(OSError):  # if the process is gone, what it last said follows
+        with contextlib.suppress(OSError):  # if the process is gone, its last answer follows
             self._child.tell(trailer)
         answer = self._child.answer(timeout + self._size / READ_BACK)
         lost = self._ring.dropped + int(answer.get("lost", len(self._ring)))

@@ -321,7 +321,7 @@ def begin(ring: Ring, document: Mapping[str, Any]) -> Recording:
 
 
 def _reason(err: Exception) -> str:
-    """Reason of a failure in one line: the system's own words, or else class and message."""
+    """Reason of a failure in one line: the system's message, or else class and message."""
     return (isinstance(err, OSError) and err.strerror) or f"{type(err).__name__}: {err}".partition("\n")[0]
 
 

@@ -28,7 +28,7 @@ from emb_runtime.system.child_process import HAS_CHILD_PROCESSES
 SLOT: Final = 256  # Bytes of one slot
 MAX_PAYLOAD: Final = SLOT - 8  # Bytes that a record may have
 
-_HEADER: Final = 4096  # one page: magic, slot count, and each index on a cache line of its own
+_HEADER: Final = 4096  # one page: magic, slot count, and one cache line for each index
 _MAGIC = 0x3130474E49524D45
 _SLOTS_AT: Final = 1
 _HEAD_AT: Final = 8
@@ -54,7 +54,7 @@ class Ring:
             raise ValueError(f"expected a ring in shared memory, got {size} bytes")
         self.fd = fd
         self._memory = mmap.mmap(fd, size) if memory is None else memory
-        # Items of a cast view are stored and loaded as whole machine words: an index is never half written.
+        # Items of a cast view are stored and loaded as machine words: an index is never half written.
         self._view = memoryview(self._memory)
         self._words = self._view[:_HEADER].cast("Q")
         self.slots = self._words[_SLOTS_AT]  # Capacity in records
@@ -69,7 +69,7 @@ class Ring:
     def create(cls, slots: int = 1 << 14) -> Ring:
         """A new, empty ring in anonymous shared memory; every page is touched, so that no push faults one in.
 
-        The slots are a power of two; the default holds about 2 s of a 1 kHz run in 4 MiB. Without processes of our own
+        The slots are a power of two; the default holds about 2 s of a 1 kHz run in 4 MiB. Without child processes
         both ends are in this one.
         """
         if slots < 1 or slots & (slots - 1):
@@ -125,7 +125,7 @@ class Ring:
         return self._words[_DROPPED_AT]
 
     def close(self) -> None:
-        """Unmap and close; the other side keeps its own mapping."""
+        """Unmap and close; the other side has its mapping still."""
         self._words.release()
         self._view.release()
         self._memory.close()
@@ -143,10 +143,10 @@ class Attachment(NamedTuple):
 
 @dataclass(frozen=True)
 class LogHeader:
-    """Identity of a run, known before it begins."""
+    """Identity of a run, complete before it begins."""
 
     start_ns: int  # The clock's monotonic time now [ns]
-    wall_offset_ns: int  # From monotonic to Unix time [ns]; fixed for the whole log, so that it has one epoch
+    wall_offset_ns: int  # From monotonic to Unix time [ns]; constant in a log, so that it has one epoch
     simulated: bool  # The clock does not follow the computer's: records are written when they happened
     dbc: str  # Text of the DBC: it decodes the frames, and travels as the attachment ``emb.dbc``
     metadata: Mapping[str, Mapping[str, str]]  # Metadata records by name; ``emb.run`` has the run's identity

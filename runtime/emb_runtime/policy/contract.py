@@ -74,8 +74,8 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     def __post_init__(self) -> None:
         if self.inputs not in INPUTS:
-            wanted = " or ".join(f"[{', '.join(names)}]" for names in INPUTS)
-            raise ValueError(f"inputs: expected {wanted}, got {shown(self.inputs)}")
+            expected = " or ".join(f"[{', '.join(names)}]" for names in INPUTS)
+            raise ValueError(f"inputs: expected {expected}, got {shown(self.inputs)}")
         for name, (low, high) in (("limits.angle", self.limits.angle), *self.ranges.items()):
             if not low <= high:
                 raise ValueError(f"{name}: expected a lower bound first")
@@ -131,7 +131,7 @@ def greatest_output(kind: str, limits: PolicyLimits | Limits) -> float:
 
 
 def read_contract(text: str) -> Contract:
-    """Read a contract of unknown origin; PolicyRefusedError says what is wrong with it."""
+    """Read a contract of unknown origin; PolicyRefusedError if something is wrong with it."""
     if len(text) > MAX_JSON_CHARACTERS:
         raise PolicyRefusedError(f"contract: expected at most {MAX_JSON_CHARACTERS} characters, got {len(text)}")
     try:

@@ -47,7 +47,7 @@ def read_graph(data: bytes) -> Graph:
     run for ever; given functions that call functions, it would write out each call. None of that is let through.
 
     Raises:
-        PolicyRefusedError: not ONNX, too large, not self-contained, with control flow, or with functions of its own.
+        PolicyRefusedError: not ONNX, too large, not self-contained, with control flow, or with functions.
     """
     model = _MODEL()
     try:
@@ -84,7 +84,7 @@ def _require_plain(model: Any) -> None:
     if any(a.HasField("g") or a.graphs for a in attributes):
         raise PolicyRefusedError("the policy has control flow (a graph inside a node): its run time has no bound")
     if model.functions:
-        raise PolicyRefusedError("the policy has functions of its own: export it with what they do in their place")
+        raise PolicyRefusedError("the policy has functions: export it with what they do in their place")
     if model.graph.sparse_initializer or any(a.HasField("sparse_tensor") or a.sparse_tensors for a in attributes):
         raise PolicyRefusedError("the policy has sparse tensors: export it with dense ones")
     if any(a.tensors for a in attributes):
@@ -135,10 +135,10 @@ def require_bounded(graph: Graph) -> None:
         if inputs is None:
             operator = re.sub(r"[^!-~]", "?", node.operator)[:60]
             raise PolicyRefusedError(
-                f"the policy has the operator '{operator}', which is none of those whose work is known to be the same "
-                "for every sample: make it of others"
+                f"the policy has the operator '{operator}', which is none of those whose work is the same for "
+                "every sample: make it of others"
             )
-        if any(name and name not in fixed for name in node.inputs[inputs]):  # an empty name is an input left out
+        if any(name and name not in fixed for name in node.inputs[inputs]):  # an empty name is a missing input
             raise PolicyRefusedError(
                 f"the policy's operator {node.operator} takes a size or a place from a computation, "
                 "so its work could grow with what is measured: make that a constant of the file"

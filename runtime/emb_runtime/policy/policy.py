@@ -51,13 +51,13 @@ class Inference:
         self.inputs = array(CODE, contract.vectors[0].inputs)
         self.outputs = array(CODE, contract.vectors[0].outputs)
         ports = {INPUT_NAME: self.inputs, OUTPUT_NAME: self.outputs}
-        wanted = [(name, "tensor(float)", [1, len(numbers)]) for name, numbers in ports.items()]
+        expected = [(name, "tensor(float)", [1, len(numbers)]) for name, numbers in ports.items()]
         found = [(port.name, port.type, port.shape) for port in self._session.get_inputs()]
         found += [(port.name, port.type, port.shape) for port in self._session.get_outputs()]
-        if found != wanted:
+        if found != expected:
             given = re.sub(r"[^ -~]", "?", str(found))[:200]
             raise PolicyRefusedError(
-                f"the policy's inputs and outputs: the contract needs {wanted}, the graph has {given}"
+                f"the policy's inputs and outputs: the contract needs {expected}, the graph has {given}"
             )
         self._binding = self._session.io_binding()
         # ONNX Runtime gets their addresses only: neither changes its size, and both live as long as this.
@@ -84,7 +84,7 @@ def open_session(data: bytes) -> ort.InferenceSession:
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
-    # As onnx_file reads it: bytes can be ONNX there and yet bear the mark of ONNX Runtime's own format.
+    # As onnx_file reads it: bytes can be ONNX there and yet bear the mark of ONNX Runtime's format.
     options.add_session_config_entry("session.load_model_format", "ONNX")
     options.log_severity_level = 4  # errors are raised
     try:
@@ -184,9 +184,9 @@ def _difference(inference: Inference, contract: Contract) -> str:
     for index, vector in enumerate(contract.vectors):
         inference.inputs[:] = array(CODE, vector.inputs)
         inference.run()
-        wanted, got = vector.outputs[0], inference.outputs[0]
-        if not abs(wanted - got) <= VECTOR_TOLERANCE * largest:  # this way round, NaN differs
-            return f"{index}: the output should be {wanted:.7g} and is {got:.7g}"
+        expected, got = vector.outputs[0], inference.outputs[0]
+        if not abs(expected - got) <= VECTOR_TOLERANCE * largest:  # this way round, NaN differs
+            return f"{index}: the output should be {expected:.7g} and is {got:.7g}"
     return ""
 
 

@@ -21,7 +21,7 @@ from emb_runtime.system import child_process
 from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child, confine, end_with
 
 PROGRAM = "emb_runtime.policy.trial"
-MEMORY = 256 << 20  # Memory that a file may take to be loaded and asked [bytes]
+MEMORY = 256 << 20  # Memory that a file may take to be loaded and evaluated [bytes]
 
 MULTIPLE = 10.0
 """Processor time for that, as a multiple of what this computer takes to start the process and import ONNX Runtime: 0.3
@@ -38,7 +38,7 @@ TIMEOUT = 300.0
 def admit_policy(source: str | Path | bytes, bench: Bench) -> Policy:
     """A policy of unknown origin, by its path or its bytes, tried and then loaded.
 
-    Where there are no processes of our own there is no brake either, only a simulated one: it is loaded untried.
+    Without child processes there is no brake either, only a simulated one: it is loaded untried.
 
     Raises:
         UsageError: the file cannot be read, or no process can be started to try it.
@@ -72,7 +72,7 @@ def _try(data: bytes, bench: Bench) -> None:
     if "accepted" in answer:
         return
     if exit_code == -signal.SIGKILL:
-        reason = f"loading and asking it takes more than {child.ready:.1f} s of processor time: not a policy of ours"
+        reason = f"loading and running it takes more than {child.ready:.1f} s of processor time: not a policy of ours"
     else:
         reason = str(answer.get("refused") or f"it could not be tried: {answer.get('error')}")
     raise PolicyRefusedError(reason)

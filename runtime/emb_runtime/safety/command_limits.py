@@ -19,7 +19,7 @@ ROUNDING: Final = 1e-6  # Relative: single precision in the policy may pass its 
 class CommandLimits(NamedTuple):
     """Limits of what may be sent, whatever the shield would need."""
 
-    current: float  # Largest current: the bench's, or a narrower one that the operator asked for [A]
+    current: float  # Largest current: the bench's, or a narrower one of the operator's [A]
     slew: float  # Largest change from one command to the next [A]
 
 
@@ -35,12 +35,12 @@ class Decision(NamedTuple):
 def checked(requested: float, contract_limit: float) -> float:
     """The policy's request [A]; raises StopError if it is not finite, or beyond its contract.
 
-    Finite is asked first: NaN passes ``min``, ``max`` and every comparison written the wrong way round.
+    Finite comes first: NaN passes ``min``, ``max`` and every comparison written the wrong way round.
     """
     if not math.isfinite(requested):
         raise StopError(Fault.POLICY_NOT_FINITE, f"it answered {requested}")
     if abs(requested) > contract_limit * (1.0 + ROUNDING):
-        detail = f"it asked for {abs(requested) / contract_limit:g} times what its contract allows"
+        detail = f"it requested {abs(requested) / contract_limit:g} times what its contract allows"
         raise StopError(Fault.POLICY_BEYOND_CONTRACT, detail)
     return requested
 
@@ -58,10 +58,10 @@ def shielded(
     current, bits = shield(law, angle, velocity, clipped, past, step)
     if low <= current <= high:
         return current, bits
-    held = min(max(current, low), high)
+    nearest = min(max(current, low), high)
     lowest, highest = window(law, angle, velocity, past)
-    if lowest <= held <= highest:
-        return held, bits | LIMITED
+    if lowest <= nearest <= highest:
+        return nearest, bits | LIMITED
     return math.nan, bits | LEFT
 
 
@@ -83,7 +83,7 @@ def decide(
         angle: newest measurement [rad].
         velocity: newest measurement [rad/s].
         requested: from :func:`checked` [A].
-        past: the last own commands, newest first [A].
+        past: the last commands, newest first [A].
         last: the command of the period before, 0 if there was none [A].
         step: index of the sample in the experiment.
     """

@@ -12,8 +12,8 @@ The reference follows the least offset of each window by at most :data:`QUARTZ`,
 by, so that what is beyond adds up: a clock that is off by a share r is noticed when (r - QUARTZ) t reaches the
 allowance, one that is slow up to two windows later. All that a device time can hide is therefore the allowance, once.
 
-False alarm only if every arming sample was delayed beyond the allowance and a later one was not, or a whole window was.
-Times are whole nanoseconds; no clock is read here.
+False alarm only if every arming sample was delayed beyond the allowance and a later one was not, or each one of a
+window was. Times are integers [ns]; no clock is read here.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class DeviceClock:
         return self.problem
 
     def _judge_grid(self, device_ns: int) -> None:
-        """Hold the time since the last sample against whole sampling periods."""
+        """Hold the time since the last sample against multiples of the sampling period."""
         elapsed_ns, self._device_ns = device_ns - self._device_ns, device_ns
         quarter_ns = self._period_ns // 4
         if elapsed_ns <= 0:

@@ -1,7 +1,7 @@
 """Monitor of the drive: the current that it reports against the last ones commanded.
 
 A current loop needs time, and a command may act some periods later, so a reported current is not compared with one
-command: it must lie among the last few that the node says it has obeyed, as opendbc compares a torque with the last
+command: it must lie among the last few that the node reports as obeyed, as opendbc compares a torque with the last
 six measured. Where the node brakes by itself, its current must lie within the bench's limit. A leaky count forgives a
 single disturbance.
 """
@@ -48,26 +48,26 @@ class DriveCheck(LeakyCount):
         if command_counter == NO_COUNTER:
             return self._judge_braking(applied)
         commanded = self._sent[command_counter]
-        known = math.isfinite(commanded)
-        if known:
+        was_sent = math.isfinite(commanded)
+        if was_sent:
             self._recent[self._oldest] = commanded
             self._oldest = (self._oldest + 1) % COMMANDS
         low, high = min(self._recent), max(self._recent)
-        if known and low - self._tolerance <= applied <= high + self._tolerance:  # this way round, NaN is outside
+        if was_sent and low - self._tolerance <= applied <= high + self._tolerance:  # this way round, NaN is outside
             self.forgive()
             return ""
         self.reject()
         if not self.exceeded:
             return ""
-        if not known:
-            return f"it says that it obeyed command {command_counter}, which was never sent"
+        if not was_sent:
+            return f"it reports that it obeyed command {command_counter}, which was never sent"
         return f"it reports {applied:.2f} A, commanded were {low:.2f} to {high:.2f} A"
 
     def _judge_braking(self, applied: float) -> str:
-        """Take a report of the node's own braking: known only from it, and where the next command's current begins."""
+        """Take a report of the node's braking: the next command's current begins there."""
         possible = abs(applied) <= self._limit + self._tolerance  # this way round, NaN is not
         self._recent = [applied if possible else 0.0] * COMMANDS
         if possible:
             return ""
         self.reject()
-        return f"it reports {applied:.2f} A of its own braking, at most {self._limit:g} A" if self.exceeded else ""
+        return f"it reports {applied:.2f} A of its braking, at most {self._limit:g} A" if self.exceeded else ""

@@ -41,7 +41,7 @@ class Guard:
         bench: for the limits and the sample time.
         send: puts a frame on the bus; the only reference to it.
         pulse: to the watchdog process.
-        limit: a current narrower than the bench's, where the operator asked for one [A].
+        limit: a current narrower than the bench's, where the operator gave one [A].
     """
 
     def __init__(
@@ -55,8 +55,8 @@ class Guard:
         self._message = layout.command
         self._limit = layout.current_within(min(bench.limits.current, CEILING_CURRENT, limit))
         self._period_ns = bench.timing.sample_time_ns
-        # The bus carries whole steps of the signal: what uses up the slew may be rounded beyond it, by half of one. A
-        # whole one is granted, so that it is never a matter of floating point.
+        # The bus carries multiples of the signal's step: the largest change may be rounded beyond the slew by half
+        # of it. One step is granted, so that floating point does not matter.
         self._slew = bench.guard.slew * bench.timing.sample_time + layout.command.signal("Current").factor
         self._send = send
         self._pulse = pulse or Unwatched()
@@ -72,7 +72,7 @@ class Guard:
 
     @property
     def next_counter(self) -> int:
-        """The alive counter that the next command must have: a refused one has not spent its own."""
+        """The alive counter that the next command must have: a refused one has used up none."""
         return 0 if self._last is None else next_counter(self._last.counter)
 
     def too_fast(self, now_ns: int) -> bool:
@@ -80,7 +80,7 @@ class Guard:
         return len(self._times) == self._most and now_ns - self._times[0] < RATE_WINDOW_PERIODS * self._period_ns
 
     def check(self, frame: Frame, state: RunState, sample_time_ns: int, now_ns: int) -> CurrentCommand:
-        """Check a command frame, which :meth:`send` may then put on the bus; gives the command that it says.
+        """Check a command frame, which :meth:`send` may then put on the bus; gives the command in it.
 
         Args:
             frame: the frame.

@@ -1,7 +1,7 @@
 """The heartbeat: a few machine words in shared memory between the loop and its watchdog process.
 
 The loop reports that it lives, that it is armed, and the counter of the last command; the watchdog that it lives, and
-whether it has tripped. Each word has one writer, and is stored and loaded whole (see
+whether it has tripped. Each word has one writer, and is stored and loaded at once (see
 :mod:`emb_runtime.log.ring_buffer`). Nothing here waits, and nothing is a system call: it costs the loop a store.
 """
 
@@ -15,7 +15,7 @@ from emb_runtime.can.e2e import COUNTER_MODULUS
 
 LOST_AFTER = 4
 """Heartbeats without a sign of life from the watchdog after which the loop holds it for lost. More than one, for the
-loop cannot tell a watchdog that is gone from a computer that was busy elsewhere; the node's own watchdog still stands
+loop cannot tell a watchdog that is gone from a computer that was busy elsewhere; the node's watchdog still stands
 behind both."""
 STOP_FRAMES = 3
 """Stop frames that end a run, from the loop or from the watchdog, one per period; one would do, and the bus may lose
@@ -24,7 +24,7 @@ one."""
 _SIZE = 4096
 _MAGIC = 0x3154414548424D45
 _MAGIC_AT, _HEARTBEAT_AT = 0, 1
-_ARMED_AT, _BEAT_AT, _LAST_AT = 8, 9, 10  # the loop's, on a cache line of their own
+_ARMED_AT, _BEAT_AT, _LAST_AT = 8, 9, 10  # the loop's, on another cache line
 _TRIPPED_AT, _SIGN_AT = 16, 17  # the watchdog's
 
 
@@ -109,7 +109,7 @@ class Heartbeat:
 
     @property
     def last(self) -> tuple[int, int]:
-        """Counter of the last command that left or was about to, and of the sample that it answers; both 0..14.
+        """Counter of the last command that was sent or about to be, and of the sample that it answers; both 0..14.
 
         They are that whatever the memory holds.
         """
@@ -125,7 +125,7 @@ class Heartbeat:
         self._words[_SIGN_AT] = now_ns
 
     def close(self) -> None:
-        """Unmap and close; the other side keeps its own mapping."""
+        """Unmap and close; the other side has its mapping still."""
         self._words.release()
         self._memory.close()
         os.close(self.fd)
@@ -135,7 +135,7 @@ class Unwatched(Heartbeat):
     """A heartbeat that no watchdog reads: of a run on a simulated bus, whose time stands still."""
 
     def __init__(self) -> None:
-        """Take memory of this process alone: another run's must not say that this one has tripped."""
+        """Take memory of this process alone: the watchdog of another run must not trip this one."""
         self._words = memoryview(bytearray(_SIZE)).cast("Q")
 
     def close(self) -> None:

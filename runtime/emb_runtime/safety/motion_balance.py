@@ -1,8 +1,8 @@
-"""Motion of a whole run against the one brake that explains it best.
+"""Motion of a run against the one brake that explains it best.
 
 In a period in which the brake slides, the velocity changes by t (k_m i − γ k_1 x⁺ − T_c sign(v) − f_v v)/J. The balance
 fits this to all such periods by least squares, with what the currents of the two periods before still do, and sums up
-what is left. A brake with other friction, a curved stiffness, a hysteresis or a delay leaves little, as its parameters
+the residuals. A brake with other friction, a curved stiffness, a hysteresis or a delay leaves little, as its parameters
 take up most of it. Sensors or a current whose scale changes, a zero or a current that is off, leave a sum that grows:
 the unexplained velocity is the range of that sum (a CUSUM of least-squares residuals: Ploberger and Krämer, The CUSUM
 test with OLS residuals, Econometrica 60, 1992).
@@ -12,8 +12,8 @@ current that is not reported adds one as well. This torque is one more regressor
 on the velocities less their mean in each stretch of sliding: the errors of velocities are independent, those of their
 changes are not.
 
-An observer shows the velocity late, and how late is known from above only. There the velocity is the change of the
-angle in a period: the mean of that period, which lags for no brake. From one mean to the next acts the mean torque of
+An observer shows the velocity late, and the bench declares only the longest lag. There the velocity is the change of
+the angle in a period: the mean of that period, which does not lag. From one mean to the next acts the mean torque of
 both periods.
 
 Plain functions of numbers and lists of them, so that the runtime and a compiled batch run the same code. What it sees
@@ -240,25 +240,25 @@ def unexplained(model: BalanceModel, state: State) -> tuple[float, float]:
 
 def _range(state: State, coefficients: list[float]) -> float:
     """Range of the sum of the residuals."""
-    low = high = _left(state.total, coefficients)
+    low = high = _residual(state.total, coefficients)
     for sums in state.entries:
-        left = _left(sums, coefficients)
-        low, high = min(left, low), max(left, high)
+        residual = _residual(sums, coefficients)
+        low, high = min(residual, low), max(residual, high)
     return high - low
 
 
-def _left(sums: list[float], coefficients: list[float]) -> float:
-    left = sums[TERMS]
+def _residual(sums: list[float], coefficients: list[float]) -> float:
+    residual = sums[TERMS]
     for j in range(len(coefficients)):
-        left -= coefficients[j] * sums[j]
-    return left
+        residual -= coefficients[j] * sums[j]
+    return residual
 
 
 def solve(equations: Rows, count: int, prior: float) -> tuple[list[float], float]:
     """Solve normal equations for the first coefficients, by Gauss's elimination; the ``prior`` is the nominal brake's.
 
     They are factors of the nominal k_m, k_1, T_c and f_v, shares of the two currents before that still act, the
-    curvature, the share of the load in friction, and the origin. Where the run says nothing of one, it is nominal.
+    curvature, the share of the load in friction, and the origin. One that the run does not determine is nominal.
 
     Returns:
         The coefficients, and the weight of the last one: the inverse of its variance for errors of variance 1.

@@ -33,8 +33,8 @@ PROVEN: Final = 1
 CONTRADICTED: Final = 2
 
 LONGEST: Final = 6.0  # Longest response that is assumed before it is proven, of all causes [samples]
-STROKE: Final = 0.5  # Share of the free stroke that is left until then
-SLOWEST: Final = 0.25  # Least share of the homeward speed that is left until then
+STROKE: Final = 0.5  # Share of the free stroke that is used until then
+SLOWEST: Final = 0.25  # Least share of the homeward speed that is used until then
 CONTRADICTS: Final = 4.5  # Errors of the estimate by which a contradicted response is beyond what is tolerated
 PROVES: Final = 3.0  # Errors of the estimate by which a proven response is within what the shield covers
 BEYOND: Final = 1.1  # Response that is no contradiction, in multiples of the declared one
@@ -45,7 +45,7 @@ LEAST_SLIDES: Final = 2.0  # Periods in which the brake slid, below which nothin
 SETTLES: Final = 4.0  # More of these after a command that was not obeyed
 LEAST_FIT: Final = 3.0  # Mean square of the normalised innovations beyond which the filter's model does not hold
 LEAST_ERROR: Final = 0.02  # Of the brake's equation, as a share of what full current adds in a sample
-KEPT: Final = 32  # Samples of a run, and of its stop, that are kept to find the cause of a contradiction
+STORED: Final = 32  # Newest samples of a run, and first ones of its stop, that tell the cause of a contradiction
 OUTSIDE: Final = 0.1  # Share by which the estimated motor may lie outside the set
 
 
@@ -58,7 +58,7 @@ class State(NamedTuple):
     flowing: float  # Mean current of the periods that the velocity may not show yet [A]
     largest: float  # Largest of these so far [A]
     lagging: float  # Current that follows the oldest command with the declared lag [A]
-    doubts: float  # Periods from now on in which the current is not known
+    doubts: float  # Periods from now on in which the current is unknown
     slides: float  # Periods so far in which the brake slid
     innovations: float  # Number of innovations so far
     misfit: float  # Sum of the squares of the normalised innovations
@@ -351,7 +351,7 @@ class Response:
 
     Attributes:
         law: of the shield, :func:`unproven_law` until the response is proven.
-        stop: the first samples of the node's own stop; their command is the current by the node's account [A].
+        stop: the first samples of the node's stop; their command is the current by the node's account [A].
     """
 
     __slots__ = ("_counter", "_full", "_rows", "_slow", "_state", "_verdict", "law", "model", "stop")
@@ -361,18 +361,18 @@ class Response:
         self._slow = self.law = unproven_law(bench, law)
         self.model = response_model(bench, law)
         self._verdict = OPEN
-        self._rows: deque[Row] = deque(maxlen=KEPT)
+        self._rows: deque[Row] = deque(maxlen=STORED)
         self.stop: list[Row] = []
 
     def begin(self, sample: SensorSample) -> None:
         """Begin a run with its first sample."""
         self._state, self._verdict = begin(self.model, sample.angle, sample.velocity), OPEN
         self._rows.clear()
-        self._keep(self._rows, sample, False, 0.0)
+        self._store(self._rows, sample, False, 0.0)
         self.law = self._slow
 
-    def _keep(self, kept: deque[Row] | list[Row], sample: SensorSample, follows: bool, command: float) -> None:
-        kept.append(tuple.__new__(Row, (follows, sample.angle, sample.velocity, command)))
+    def _store(self, rows: deque[Row] | list[Row], sample: SensorSample, follows: bool, command: float) -> None:
+        rows.append(tuple.__new__(Row, (follows, sample.angle, sample.velocity, command)))
         self._counter = sample.counter
 
     @property
@@ -386,11 +386,11 @@ class Response:
         return self._verdict == PROVEN
 
     def take(self, sample: SensorSample, follows: bool, command: float) -> None:
-        """Take one more sample, as :func:`take`; once the response is proven it is only kept.
+        """Take one more sample, as :func:`take`; once the response is proven it is only stored.
 
         Raises StopError if the velocity follows the commands later, or earlier, than declared.
         """
-        self._keep(self._rows, sample, follows, command)
+        self._store(self._rows, sample, follows, command)
         if self.proven:
             return
         self._state, self._verdict = take(self.model, self._state, follows, sample.angle, sample.velocity, command)
@@ -400,10 +400,10 @@ class Response:
             self.law = self._full
 
     def watch(self, sample: SensorSample) -> None:
-        """Keep one sample of the stop."""
-        if len(self.stop) < KEPT:
+        """Store one of the first samples of the stop."""
+        if len(self.stop) < STORED:
             follows = sample.counter == next_counter(self._counter)
-            self._keep(self.stop, sample, follows, sample.applied_current)
+            self._store(self.stop, sample, follows, sample.applied_current)
 
     @property
     def text(self) -> str:

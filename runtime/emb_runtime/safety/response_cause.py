@@ -99,18 +99,18 @@ def likelihood(
     """Minus twice the log-likelihood of frames of one age and a current with one lag [s]; infinite if they do not fit.
 
     The overshoot is then that of the lag, and no unknown. The measurements are late by ``seen`` periods of the age, the
-    commands by the others: they wait, and the node's own current does not. With ``means`` the velocities are means
-    of the periods before: these change by the mean of two currents.
+    commands by the others: they wait, and the current of the node's stop does not. With ``means`` the velocities are
+    means of the periods before: these change by the mean of two currents.
     """
     doubts = age + 1.0 + math.ceil(3.0 * lag / model.sample_time)
     slides = 6.0 * model.deviation
     tried = model._replace(age=0, oldest=0, lag=lag, extra=0.0, transient=0.0, doubts=doubts, slides=slides)
     state, share = begin(tried, rows[0].angle, rows[0].velocity), model.current * lag
     mean, p = state.mean, state.covariance
-    known = (*p[:10], share * p[6], *p[11:20], share * share * p[6])
-    state = state._replace(mean=(*mean[:5], share * mean[1]), covariance=known)
+    covariance = (*p[:10], share * p[6], *p[11:20], share * share * p[6])
+    state = state._replace(mean=(*mean[:5], share * mean[1]), covariance=covariance)
     flowing = rows[0].command  # the run's first sample has none
-    if rows[0].follows:  # the commands before it are not known
+    if rows[0].follows:  # the commands before it are unknown
         state = state._replace(doubts=doubts, lagging=flowing)
     commands = [flowing] * (age - seen) + [row.command for row in rows[1:]]
     acting = [flowing] * seen + commands[: len(rows) - 1] + [row.command for row in stop]
@@ -149,19 +149,19 @@ def observer_bandwidth(model: ResponseModel, rows: Sequence[Row]) -> float:
 def _unlike(model: ResponseModel, rows: Sequence[Row], bandwidth: float) -> float:
     """Sum of the squared differences of the velocities from those of an observer of the angles [rad²/s²].
 
-    The observer's angle follows from two velocities: at the begin and where a sample is missing it is not known.
+    The observer's angle follows from two velocities: at the begin and where a sample is missing it is unknown.
     """
-    ts, known = model.sample_time, False
+    ts, follows = model.sample_time, False
     alpha, beta = observer_gains(bandwidth, model.sample_time)
     angle = velocity = squares = 0.0
     for before, row in pairwise(rows):
         if not row.follows:
-            known = False
+            follows = False
             continue
         ahead = angle + ts * velocity
-        surprise = row.angle - ahead if known else ts / beta * (row.velocity - before.velocity)
+        surprise = row.angle - ahead if follows else ts / beta * (row.velocity - before.velocity)
         angle = row.angle - (1.0 - alpha) * surprise
-        velocity = velocity + beta / ts * surprise if known else row.velocity
+        velocity = velocity + beta / ts * surprise if follows else row.velocity
         squares += (row.velocity - velocity) ** 2
-        known = True
+        follows = True
     return squares

@@ -67,7 +67,7 @@ class State(NamedTuple):
     highs: Currents  # Greatest current that may have acted
     flowing: tuple[float, float]  # Least and greatest current that may flow in a motor whose current lags [A]
     obeys: bool
-    """True once the motion has excluded a motor, or a velocity, with the wrong sign: the node's own stop brakes."""
+    """True once the motion has excluded a motor, or a velocity, with the wrong sign: the node's stop brakes."""
     confirmed: bool  # True once the polarity is confirmed
 
 
@@ -109,7 +109,7 @@ def judge(
         elapsed: time since the sample before, by the device's clock [s].
         angle: measured [rad].
         velocity: measured [rad/s].
-        obeyed: the node says that the command which answered the sample before acted.
+        obeyed: by the node's report the command which answered the sample before acted.
         command: that command; 0 if none was sent [A].
         reported: the current that the node reports of the period [A].
 
@@ -126,7 +126,7 @@ def judge(
     periods = 1 if periods < 1 else periods
     travelled, expected = angle - x, 0.5 * elapsed * (velocity + v)
     slack = limits.offset * elapsed
-    if periods > 1:  # the velocity between is known within a triangle of the greatest acceleration, up or down
+    if periods > 1:  # between them the velocity lies within a triangle of the greatest acceleration, up or down
         slack += 0.25 * elapsed * elapsed * law.change / law.sample_time
     travel = add(travel, travelled - expected, slack, slack)
     up, down = travel
@@ -163,7 +163,7 @@ def judge(
         strongest += law.box.spring_high * max(law.reach - xl, 0.0)
         against = add(opposed.motion, change, share * _gain(law, vl, strongest), share * _gain(law, -vh, -weakest))
         opposed = Opposed(opposed.travel + (travelled + expected), opposed.integral + expected, opposed.begin, against)
-        if periods > 1:  # the integral is not known well enough: begin anew
+        if periods > 1:  # the integral is not accurate enough: begin anew
             opposed = Opposed(0.0, 0.0, velocity, against)
         verdict, shown, confirmed = _judge_polarity(limits, opposed, motion, velocity, contradicts)
         obeys = obeys or shown
@@ -180,7 +180,7 @@ def largest_current(law: ShieldLaw, limits: SensorThresholds, state: State, limi
     if state.obeys:
         return limit
     stoppable = _stoppable_current(law, limits, state)
-    if abs(state.velocity) <= law.velocity_noise:  # what rests may be moved; what moves is first left to friction
+    if abs(state.velocity) <= law.velocity_noise:  # what rests may be moved; friction stops what moves
         stoppable = max(stoppable, limits.first_current)
     return min(limit, stoppable)
 

@@ -106,7 +106,7 @@ def _faulted(run: Run, fault: Fault, now_ns: int) -> Run:
     first = run.fault or fault
     if run.state is RunState.STOPPING:  # the stop goes on as it is
         return run._replace(fault=first)
-    # Before arming nothing has left, so there is nothing to stop; after it, every way out sends stop frames.
+    # Before arming nothing was sent, so there is nothing to stop; after it, every way out sends stop frames.
     nothing_sent = run.state in (RunState.INIT, RunState.SILENT)
     return run._replace(state=RunState.OVER if nothing_sent else RunState.STOPPING, since_ns=now_ns, fault=first)
 
@@ -161,7 +161,7 @@ FAULTS: dict[Fault, FaultInfo] = {
         "the brake left its limits", "the brake is outside the bench's shield ranges: widen them"
     ),
     Fault.NODE_STOPPED: FaultInfo(
-        "the node began its own safe stop",
+        "the node began a safe stop",
         "its stop reason is below; WATCHDOG: this computer answered too late; LIMIT: the brake is outside the "
         "bench's shield ranges",
     ),
@@ -180,7 +180,7 @@ FAULTS: dict[Fault, FaultInfo] = {
         "the policy answered with a number that is not finite", "the actor is broken: train or export it again"
     ),
     Fault.POLICY_BEYOND_CONTRACT: FaultInfo(
-        "the policy asked for more than its contract allows", "the actor is broken: export it again"
+        "the policy requested more than its contract allows", "the actor is broken: export it again"
     ),
     Fault.GUARD_REJECTED: FaultInfo(
         "the guard refused a command", "this is an error in the program: please report it with the log"

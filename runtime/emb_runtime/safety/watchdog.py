@@ -2,7 +2,7 @@
 
 The process (:mod:`emb_runtime.safety.watchdog_process`) stands beside the loop, not in it: it sends the stop frames
 when the loop is stopped, killed, hung in a call or blocked on the GIL, and cannot send any more itself.
-Behind it stands the node's own watchdog, which needs nobody on this computer.
+Behind it stands the node's watchdog, which needs nobody on this computer.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class WatchdogResult:
     """``stalled``: the loop stood still; ``gone``: it ended while it was watched; empty: it did not trip."""
     time_ns: int = 0  # Time at which it tripped, monotonic; 0 if it did not [ns]
     silence_ns: int = 0  # Age of the loop's last sign of life then; 0 if it did not trip [ns]
-    frames: int = 0  # Stop frames that left
+    frames: int = 0  # Stop frames that were sent
     lateness_ns: int = 0  # Largest lateness of a look at the heartbeat [ns]
     error: str = ""  # Error that kept it from its report or its stop frames; empty if there was none
     realtime: dict[str, str] = field(default_factory=dict)
@@ -65,7 +65,7 @@ class WatchdogHandle:
         """Start the process and wait until it is on the bus and watches.
 
         Args:
-            transport: the loop's own, open. The process opens the same bus once more, for itself.
+            transport: the loop's, open. The process opens the same bus once more, for itself.
             bench: the bench.
             heartbeat: silence of the loop that trips it [s].
             real_time: the process asks for real-time behaviour, above the loop's.

@@ -1,7 +1,7 @@
 """The watchdog process: sends the stop frame when the loop stands still or is gone, and can send nothing else.
 
 ``python -m emb_runtime.safety.watchdog_process HEARTBEAT_FD [LOOP_SOCKET_FD] DOCUMENT_FD``, started by
-:class:`emb_runtime.safety.watchdog.Watchdog` and by nobody else. It has a bus socket of its own, a priority above the
+:class:`emb_runtime.safety.watchdog.Watchdog` and by nobody else. It has another socket of the bus, a priority above the
 loop's, and 225 frames made beforehand: disabled, 0 A, one for each pair of counters. What is in the shared memory
 chooses among them and cannot make another.
 
@@ -40,8 +40,8 @@ from emb_runtime.system.clock import Clock
 PRIORITY = realtime.PRIORITY + 10  # Above the loop's, which may hog the only processor
 LOOKS = 5  # Looks at the heartbeat within its time
 LONGEST_SILENCE = 2  # Heartbeats after which a silence is one too many, whoever's time was stolen
-STOP_TRIES = 50  # Periods in which a stop frame is tried until so many have left: the transmit queue may be full
-REST_NS = 100_000_000  # Time between two looks after the trip, when all that is left is to wait for the loop's end [ns]
+STOP_TRIES = 50  # Periods in which a stop frame is tried until so many were sent: the transmit queue may be full
+REST_NS = 100_000_000  # Time between two looks after the stop frames, until the loop's process ends [ns]
 
 StopFrames = tuple[tuple[Frame, ...], ...]
 """Stop frames by alive counter, and by the counter of the sample that they answer."""
@@ -112,7 +112,7 @@ class Watchdog:
     period_ns: int  # Between two stop frames [ns]
     clock: Clock
     send: Callable[[Frame], None]  # Puts a frame on the bus; raises BusError, or whatever a vendor's driver does
-    silence_loop: Callable[[], None]  # Takes the bus away from the loop's own socket; raises OSError
+    silence_loop: Callable[[], None]  # Takes the bus away from the loop's socket; raises OSError
     wait: Callable[[int], bool]  # Waits until a time or until the loop's process is gone, and gives whether it is
     tripped: str = ""
     time_ns: int = 0  # Time of the last look [ns]
@@ -122,7 +122,7 @@ class Watchdog:
     error: str = ""
 
     def run(self) -> dict[str, Any]:
-        """Watch until there is nothing to watch any more; says what happened, see ``WatchdogResult``."""
+        """Watch until there is nothing to watch any more; returns what happened, see ``WatchdogResult``."""
         status = self._watch()
         if status is not LoopStatus.OVER:
             self._stop(status)

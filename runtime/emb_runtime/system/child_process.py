@@ -1,4 +1,4 @@
-"""Processes of our own: each takes one document, answers in lines of JSON, and ends when its standard input does.
+"""Child processes: each takes one document, answers in lines of JSON, and ends when its standard input does.
 
 The runtime's side is :class:`Child`; the functions below it are for the child.
 """
@@ -21,17 +21,17 @@ from typing import Any
 
 from emb_runtime.system.terminal import ENDING
 
-HAS_CHILD_PROCESSES = sys.platform == "linux"  # True where there are processes of our own
-END_TIMEOUT = 1.0  # Time for the process to end when nothing is asked of it any more; then it is killed [s]
+HAS_CHILD_PROCESSES = sys.platform == "linux"  # True where child processes are started
+END_TIMEOUT = 1.0  # Time for the process to end once its input is closed; then it is killed [s]
 
 MAX_ANSWER = 1 << 20  # Longest line that it may answer [bytes]
 _PR_SET_PDEATHSIG = 1
 
 
 class Child:
-    """A running process ``python -m MODULE FD... DOCUMENT_FD`` that has said that it is ready, within a time-out [s].
+    """A running process ``python -m MODULE FD... DOCUMENT_FD`` that is ready, within a time-out [s].
 
-    OSError if it cannot be started, or has said ``error``; the message says why, and has the name.
+    OSError, with the name and the reason, if it cannot be started or has answered ``error``.
     """
 
     def __init__(
@@ -41,12 +41,12 @@ class Child:
 
         self._name = name
         self._answers = b""
-        # The document goes through memory of its own: a pipe could fill up, and block, while the process boots.
+        # The document goes through shared memory: a pipe could fill up, and block, while the process boots.
         fd = os.memfd_create(name, os.MFD_CLOEXEC)
         with os.fdopen(fd, "wb") as memory:
             memory.write(json.dumps(document).encode())
             memory.flush()
-            # -P: modules of the working directory are not ours. A group of its own: Ctrl-C is for the runtime.
+            # -P: modules of the working directory are not ours. A new group: Ctrl-C is for the runtime.
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", module, *map(str, fds), str(fd)],
                 stdin=subprocess.PIPE,
@@ -99,13 +99,13 @@ class Child:
                 return {"error": f"the {self._name} process died ({ending})"}
             self._answers += chunk
             if len(self._answers) > MAX_ANSWER:
-                return {"error": f"the {self._name} process said more than {MAX_ANSWER} bytes at once"}
+                return {"error": f"the {self._name} process wrote more than {MAX_ANSWER} bytes at once"}
         line, _, self._answers = self._answers.partition(b"\n")
         try:
             answer = json.loads(line)
         except (ValueError, RecursionError):
             answer = None
-        return answer if isinstance(answer, dict) else {"error": f"the {self._name} process said what is no answer"}
+        return answer if isinstance(answer, dict) else {"error": f"the {self._name} process wrote what is no answer"}
 
     @property
     def exit_code(self) -> int | None:
@@ -127,7 +127,7 @@ class Child:
         """Wait until it has ended, and kill it if it does not."""
         for pipe in (self._process.stdin, self._process.stdout):
             assert pipe is not None
-            with contextlib.suppress(OSError):  # what the pipe still held has nowhere to go
+            with contextlib.suppress(OSError):  # what the pipe still has goes nowhere
                 pipe.close()
         deadline = time.monotonic() + END_TIMEOUT
         while self.alive and time.monotonic() < deadline:

@@ -58,7 +58,7 @@ class MonotonicClock:
 class TimeUnwrapper:
     """Makes a device time that wraps into one that does not, from when each stamp arrived.
 
-    The arrival says roughly where the device's clock must be, to well within half a wrap; the stamp says exactly where.
+    The arrival gives the device's clock to well within half a wrap; the stamp gives it exactly.
     Silences of any length are bridged as long as the two clocks drift less than half a wrap apart meanwhile.
     """
 

@@ -3,7 +3,7 @@
 A wheel for one kind of processor has them beside the sources, from which mypyc compiled them
 (``tools/compile_core.py``); whoever builds it compares both, bit for bit (``tests/compiled``). Nothing
 imports them by itself: :func:`choose`, which ``emb-run`` calls before it imports anything else, puts a finder in front
-of Python's own. Every other command works with the sources.
+of Python's. Every other command works with the sources.
 
 ``EMB_CORE`` decides otherwise: ``python`` takes the sources, ``compiled`` the compiled core in every command of this
 environment. The processes that a command starts take the sources.
@@ -14,7 +14,7 @@ Idioms that only speed or the compiler asks for, in the modules that are compile
   where compiled code calls it, and takes twice as long.
 * ``IDLE: Final = NodeState.IDLE``, ``MISSED: Final = int(Reason.MISSED)``: in Python 3.11 a member of an enumeration
   takes as long as a call, and an ``IntFlag`` combines its members in Python.
-* A name of its own for each ``except … as name``: mypyc gives a name the type of the function's first clause, and
+* Another name in each ``except … as name``: mypyc gives a name the type of the function's first clause, and
   another exception becomes a TypeError.
 * ``Number`` (``can/codec.py``) for what may be an int or a float: the annotation ``float`` converts ints.
 * No ``cached_property``, which is computed at each access; no subclass of a compiled class and no replaced method:
@@ -58,7 +58,7 @@ class CoreError(Exception):
 
 
 class _Finder:
-    """Finds compiled modules by name, before Python's own finders find their sources."""
+    """Finds compiled modules by name, before Python's finders find their sources."""
 
     def __init__(self, files: Mapping[str, str]) -> None:
         self.files = files
@@ -80,14 +80,14 @@ def running() -> Core:
 def choose() -> None:
     """Take the compiled core if one is installed for these sources, unless ``EMB_CORE`` forbids."""
     global _running
-    wanted = os.environ.get(CHOICE, "")
-    if wanted not in ("", "python", "compiled"):
-        raise UsageError(f"{CHOICE}: expected python or compiled, got '{wanted}'")
-    if wanted == "python":
+    choice = os.environ.get(CHOICE, "")
+    if choice not in ("", "python", "compiled"):
+        raise UsageError(f"{CHOICE}: expected python or compiled, got '{choice}'")
+    if choice == "python":
         _running = Core(False, f"Python, as {CHOICE} asks")
-    elif not wanted and (FOLDER / MANIFEST).exists():  # with a wish this package has taken it
+    elif not choice and (FOLDER / MANIFEST).exists():  # else this package has taken it already
         try:
-            take()
+            take_compiled()
         except CoreError as err:
             _running = Core(False, "Python", f"the compiled core is not taken: {err}")
 
@@ -95,12 +95,12 @@ def choose() -> None:
 def take_or_end() -> None:
     """Take the compiled core, as ``EMB_CORE=compiled`` asks, or end this process."""
     try:
-        take()
+        take_compiled()
     except CoreError as err:
         raise SystemExit(complain(f"{CHOICE}=compiled", UsageError(str(err)))) from err
 
 
-def take() -> None:
+def take_compiled() -> None:
     """Have the modules of the core imported compiled from now on; raises CoreError if there is none."""
     global _running
     finder = _Finder(_files())
@@ -120,10 +120,10 @@ def _files() -> dict[str, str]:
     try:
         found = json.loads((FOLDER / MANIFEST).read_text(encoding="utf-8"))
         files: dict[str, str] = found["files"]
-        wanted = identity(name for name in files if "." in name)
+        current = identity(name for name in files if "." in name)
     except (OSError, ValueError, TypeError, KeyError) as err:
         raise CoreError(f"its manifest or a source cannot be read: {one_line(str(err))}") from err
-    if found["identity"] != wanted:
+    if found["identity"] != current:
         raise CoreError("it was compiled from other sources, or for another interpreter or processor")
     return files
 

@@ -33,7 +33,7 @@ def start(
 
     Args:
         module: imported here.
-        message: said of a Ctrl-C in ``main`` that nobody has taken, unless the exception says it.
+        message: printed for a Ctrl-C in ``main`` that nobody has taken, unless the exception has one.
         interrupted: exit code for it.
         prepare: called before the import.
         takes_signals: ``main`` does; until then a Ctrl-C ends the process as in the imports.
@@ -97,7 +97,7 @@ def _raise_again(lost: sys.UnraisableHookArgs) -> None:
 
 def _prepare_streams() -> None:
     """Every standard stream is open, and output takes any text."""
-    for descriptor in (0, 1, 2):  # a closed one would be given to the next file, and lost to a child's own
+    for descriptor in (0, 1, 2):  # a closed one would be given to the next file, and lost to a child's
         try:
             os.fstat(descriptor)
         except OSError:
@@ -118,7 +118,7 @@ def _flush() -> None:
 
 
 def emb_gateway() -> int:
-    """A drive with a protocol of its own as a node of emb-run; until it opens anything, Ctrl-C just ends it."""
+    """A drive with another protocol as a node of emb-run; until it opens anything, Ctrl-C just ends it."""
     return start("emb_runtime.cli.gateway", "", takes_signals=True)
 
 

@@ -33,7 +33,7 @@ _FLAGS = functools.reduce(operator.or_, (getattr(os, name, 0) for name in _WANTE
 
 
 class _Regular(io.FileIO):
-    """A file of which each read gives bytes or raises OSError: of one of the kernel's own it may have to be waited."""
+    """A file of which each read gives bytes or raises OSError: some files of the kernel have none yet."""
 
     def readinto(self, buffer: Any) -> int:
         """Read into a buffer; gives the number of bytes."""
@@ -41,7 +41,7 @@ class _Regular(io.FileIO):
         return _there(count)
 
     def readall(self) -> bytes:
-        """Read all that is left."""
+        """Read the rest."""
         return _there(super().readall())
 
 

@@ -39,14 +39,14 @@ _NOT_ASCII = re.compile("[^ -~]")
 _FOLDERS = re.compile(r"(^|[=@:,])(?:/|[A-Za-z]:[\\/])(?:[^\\/]*[\\/])*(?=[^\\/])")
 
 
-def escaped(text: str, kept: str = "") -> str:
-    """A text in which all characters but printable ones and those ``kept`` are escape sequences.
+def escaped(text: str, allowed: str = "") -> str:
+    """A text in which all characters but printable ones and those ``allowed`` are escape sequences.
 
     So none controls a terminal, changes the direction of the text, or cannot be seen.
     """
     if text.isprintable():
         return text
-    return _NOT_ASCII.sub(lambda c: c[0] if c[0].isprintable() or c[0] in kept else ascii(c[0])[1:-1], text)
+    return _NOT_ASCII.sub(lambda c: c[0] if c[0].isprintable() or c[0] in allowed else ascii(c[0])[1:-1], text)
 
 
 def without_folders(text: str) -> str:
@@ -90,16 +90,16 @@ def mention(text: str) -> None:
 
 
 class StopRequest:
-    """Set by Ctrl-C, SIGTERM and SIGHUP from now on, asked by the loop."""
+    """Set by Ctrl-C, SIGTERM and SIGHUP from now on, read by the loop."""
 
     def __init__(self) -> None:
         self._requested = False
         for number in ENDING:
-            if signal.getsignal(number) is not signal.SIG_IGN:  # nohup asked for that one to be ignored
+            if signal.getsignal(number) is not signal.SIG_IGN:  # nohup had that one ignored
                 signal.signal(number, self._request)
 
     def __call__(self) -> bool:
-        """Returns True if an end is wanted."""
+        """Returns True if the operator has ended the command."""
         return self._requested
 
     def _request(self, _signal: int, _frame: object) -> None:
@@ -107,7 +107,7 @@ class StopRequest:
 
 
 def is_interactive() -> bool:
-    """Returns True if standard input is a terminal, so that somebody can be asked."""
+    """Returns True if standard input is a terminal, so that somebody can answer."""
     return sys.stdin is not None and sys.stdin.isatty()
 
 

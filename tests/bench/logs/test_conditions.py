@@ -108,7 +108,7 @@ def test_a_mapped_drive_s_own_signals_are_read_from_its_bus_where_they_can_be_be
             wall_offset_ns=0,
             simulated=True,
             dbc=LAYOUT.text,
-            messages=LAYOUT.known,
+            messages=LAYOUT.all_messages,
             metadata={"emb.run": {}, "emb.drive": {"bus": "can0", "lost": ""}},
             attachments=[
                 Attachment("drive.toml", "application/toml", given.encode()),

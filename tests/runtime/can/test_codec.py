@@ -77,7 +77,7 @@ def both(text: str) -> tuple[Message, Any]:
 
 
 MESSAGES: dict[str, tuple[Message, Any]] = {
-    **{message.name: (message, DATABASE.get_message_by_name(message.name)) for message in load_layout().known},
+    **{message.name: (message, DATABASE.get_message_by_name(message.name)) for message in load_layout().all_messages},
     **{f"drawn with seed {seed}": both(drawn(seed)) for seed in range(16)},
 }
 

@@ -30,7 +30,7 @@ from emb_runtime.records import CurrentCommand, Frame, NodeState
 from tests.independent import DATABASE, protected
 
 LAYOUT = load_layout()
-MESSAGES = list(LAYOUT.known)
+MESSAGES = list(LAYOUT.all_messages)
 
 COMMAND = CurrentCommand(counter=3, answers=2, current=-5.5, enable=True)
 # Worked by hand from the DBC; the CRC byte from an independent library.
@@ -202,7 +202,7 @@ def test_a_frame_of_one_message_never_passes_for_another(body: bytes) -> None:
 
 def test_the_messages_are_those_of_the_protocol() -> None:
     assert list(LAYOUT.messages) == ["EMB_Command", "EMB_Angle", "EMB_Velocity", "EMB_Status"]
-    assert [m.name for m in LAYOUT.known] == [*LAYOUT.messages, "EMB_Charge", "EMB_Gateway", "EMB_Conditions"]
+    assert [m.name for m in LAYOUT.all_messages] == [*LAYOUT.messages, "EMB_Charge", "EMB_Gateway", "EMB_Conditions"]
 
 
 def test_the_charge_is_rounded_to_its_step_and_wraps() -> None:
@@ -231,8 +231,8 @@ def test_the_bus_load_is_that_of_worst_case_stuffing() -> None:
 
 
 def test_each_message_reads_back_from_the_document_of_a_process() -> None:
-    document = json.loads(json.dumps(to_builtins(LAYOUT.known, str_keys=True)))
-    assert tuple(map(from_document, document)) == LAYOUT.known
+    document = json.loads(json.dumps(to_builtins(LAYOUT.all_messages, str_keys=True)))
+    assert tuple(map(from_document, document)) == LAYOUT.all_messages
 
 
 def test_the_bench_identity_is_the_start_of_its_hash() -> None:

@@ -153,7 +153,7 @@ def test_a_status_that_contradicts_the_pairs_ends_the_run(
 
     run = simulate(on_receive=receive)
     assert run.outcome.fault is fault, run.outcome.detail
-    assert f"status says {state.name}" in run.outcome.detail
+    assert f"status is {state.name}" in run.outcome.detail
     assert run.journal.cycles[-1].step + run.journal.cycles[0].device_time_ns // 1_000_000 <= said[0] + within
     assert_within_limits(run)
 
@@ -167,7 +167,7 @@ def test_a_status_from_before_the_first_command_ends_no_run(simulate: Simulate, 
 def test_a_node_whose_status_says_fault_is_not_armed(simulate: Simulate) -> None:
     outcome = simulate(on_receive=changing(saying(NodeState=int(NodeState.FAULT)), STATUS)).outcome
     assert (outcome.fault, outcome.end) == (Fault.NODE_NOT_READY, None)
-    assert outcome.detail == "its status says FAULT"
+    assert outcome.detail == "its status is FAULT"
 
 
 @pytest.mark.parametrize(

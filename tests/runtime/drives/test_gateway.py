@@ -634,7 +634,7 @@ def test_after_a_frame_of_the_arming_sequence_that_the_second_guard_refused_only
     node = DriveNode(altered, parse_bench(late_bench(), "bench.toml"), LAYOUT, sent.append)
     node.arm(0)
     assert isinstance(node.phase, Failed)
-    assert "Control_Mode says 0, meant was 1" in node.failure
+    assert "Control_Mode is 0, expected 1" in node.failure
     assert [(frame.identifier, frame.data) for frame in sent] == [
         (0x00E, bytes(4)), (0x00E, bytes(4)), (0x007, b"\x01\0\0\0"),
     ]  # fmt: skip

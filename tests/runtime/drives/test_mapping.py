@@ -204,7 +204,7 @@ def test_multiplexed_signals_are_read_by_the_value_of_their_multiplexor_and_sent
     frame = encoder.command(2.0)
     assert frame.data == b"\x03" + struct.pack("<fH", 2.0 * 0.0217, 0)
     assert guard.command(frame, 2.0) == pytest.approx(2.0, rel=1e-6)
-    with pytest.raises(WireGuardError, match="Mode says 4"):
+    with pytest.raises(WireGuardError, match="Mode is 4"):
         guard.command(frame._replace(data=b"\x04" + frame.data[1:]), 2.0)
     for step in mapping.disarm:
         for constant in step.frames:

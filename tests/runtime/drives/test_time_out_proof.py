@@ -33,7 +33,7 @@ def begun(first: int = 0, period: int = 100, polled: bool = False) -> tuple[Time
     it = proof(polled)
     assert silent(it, 400) == []
     for number in (0, 1):
-        it.take(ACTIVE, (first + number * period) * MS)
+        it.add_report(ACTIVE, (first + number * period) * MS)
     last = silent(it, 400)[0] - 1
     it.fed(last * MS)
     return it, last
@@ -46,7 +46,7 @@ def test_the_silence_begins_so_that_a_message_comes_one_period_after_the_time_ou
         assert last == first + period + wait
         assert silent(it, 400) == list(range(last + 1, 400))
         it.fed((last + 1) * MS)  # too late to count
-        it.take(IDLE, (last + 11) * MS)
+        it.add_report(IDLE, (last + 11) * MS)
         assert (it.done, it.seen_ns, it.failure) == (True, 11 * MS, "")
         assert silent(it, 400) == []
 
@@ -54,9 +54,9 @@ def test_the_silence_begins_so_that_a_message_comes_one_period_after_the_time_ou
 def test_a_message_before_the_silence_moves_it() -> None:
     it, last = begun(0, 200)  # one was lost
     it.fed((last - 1) * MS)
-    it.take(ACTIVE, 300 * MS)
+    it.add_report(ACTIVE, 300 * MS)
     assert silent(it, 600)[0] == 390
-    it.take(ACTIVE, 389 * MS)  # at the last instant
+    it.add_report(ACTIVE, 389 * MS)  # at the last instant
     assert silent(it, 600)[0] == 390 + 78
 
 
@@ -77,17 +77,17 @@ def test_what_it_says_up_to_two_periods_after_the_time_out_decides(
 ) -> None:
     it, last = begun()
     it.fed(last * MS)
-    it.take(said, last * MS + after_ns)
+    it.add_report(said, last * MS + after_ns)
     found = {"done": it.done, "unresolved": it.unresolved, "failed": bool(it.failure)}
     assert [name for name, there in found.items() if there] == [outcome][: bool(outcome)]
     assert it.seen_ns == after_ns
     assert it.over == bool(outcome)
     if outcome == "failed":
-        assert "did not act: 0.012 s after the last command it was still armed, node.watchdog says 0.01 s" in it.failure
+        assert "did not act: 0.012 s after the last command it was still armed, node.watchdog is 0.01 s" in it.failure
     if outcome:  # what comes later changes nothing
         before = (it.done, it.unresolved, it.failure, it.seen_ns)
         for later, ms in ((ACTIVE, 130), (IDLE, 230)):
-            it.take(later, (last + ms) * MS)
+            it.add_report(later, (last + ms) * MS)
         it.tick(0)
         it.tick(10_000 * MS)
         assert (it.done, it.unresolved, it.failure, it.seen_ns) == before
@@ -106,24 +106,24 @@ def test_before_a_silence_nothing_is_asked_and_nothing_seen() -> None:
 def test_without_a_frame_to_it_a_drive_has_been_left_alone_since_the_begin_of_time() -> None:
     it = proof()
     for ms, said in ((500, ACTIVE), (511, ACTIVE), (522, IDLE)):
-        it.take(said, ms * MS)
+        it.add_report(said, ms * MS)
     assert (it.unresolved, it.seen_ns) == (True, 522 * MS)
 
 
 def test_times_are_rounded_to_the_nearest_nanosecond() -> None:
     it = TimeOutProof(0.010, STATE, MS + 1, polled=True, aim=0.75)
     for ns in (5, 6):
-        it.take(ACTIVE, ns)
+        it.add_report(ACTIVE, ns)
     assert it.asks_ns == 6 + 10_750_001
     it = TimeOutProof(0.010, STATE, MS + 1, polled=False)
     for ns in (5, 6):
-        it.take(ACTIVE, ns)
+        it.add_report(ACTIVE, ns)
     assert it.silent(7)
     it = TimeOutProof(ODD, STATE, MS, polled=False)
     for ns in (5, 6):
-        it.take(ACTIVE, ns)
+        it.add_report(ACTIVE, ns)
     it.fed(6)
-    it.take(IDLE, 6 + 15_700_000 + 2 * MS)
+    it.add_report(IDLE, 6 + 15_700_000 + 2 * MS)
     assert it.done
 
 
@@ -132,21 +132,21 @@ def test_a_polled_drive_is_asked_after_the_silence_to_the_nanosecond(aim: float)
     length = 15_700_000 + round(aim * MS)
     for polled in (True, False):
         it = TimeOutProof(ODD, STATE, MS, polled=polled, aim=aim)
-        it.take(ACTIVE, 3 * MS)
-        it.take(ACTIVE, 5 * MS)
+        it.add_report(ACTIVE, 3 * MS)
+        it.add_report(ACTIVE, 5 * MS)
         begin = 5 * MS if polled else 5 * MS + -length % (2 * MS)
         assert it.asks_ns == begin + length
         assert [it.silent(begin + ns) for ns in (0, 1, length - 1, length)] == [False, True, True, not polled]
         it.fed(begin)
         it.fed(begin + length)  # asks
-        it.take(IDLE, begin + length + 1)
+        it.add_report(IDLE, begin + length + 1)
         assert (it.done, it.seen_ns) == (True, length + 1)
 
 
 def test_two_messages_of_one_time_are_no_period_of_nothing() -> None:
     it = proof()
-    it.take(ACTIVE, 5 * MS)
-    it.take(ACTIVE, 5 * MS)
+    it.add_report(ACTIVE, 5 * MS)
+    it.add_report(ACTIVE, 5 * MS)
     assert it.silent(5 * MS + 1)
 
 
@@ -159,7 +159,7 @@ def test_the_time_to_say_something_is_known_to_the_nanosecond() -> None:
 
 def test_a_drive_that_does_not_say_what_it_does_is_given_up() -> None:
     it = proof()
-    it.take(ACTIVE, 7 * MS)
+    it.add_report(ACTIVE, 7 * MS)
     for ms, failed in ((7, False), (1019, False), (1020, True)):
         it.tick(ms * MS)
         assert bool(it.failure) == failed
@@ -205,7 +205,7 @@ class Drive:
                 before, fed = fed, now
             for at in messages:
                 last = before if polled else fed  # packed before the frame that asks is unpacked
-                it.take(ACTIVE if self._armed(last, at - step if polled else now) else IDLE, at)
+                it.add_report(ACTIVE if self._armed(last, at - step if polled else now) else IDLE, at)
             if it.over:
                 return "done" if it.done else "unresolved" if it.unresolved else "failed"
         raise AssertionError("nothing was decided")

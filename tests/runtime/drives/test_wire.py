@@ -75,7 +75,7 @@ def test_frames_of_the_wrong_length_and_of_others_make_no_sample() -> None:
         receiver.take(wrong)
     assert receiver.take(iq(0.0, MS)) is None
     assert receiver.rejected == {"wrong length": 2}
-    assert receiver.refusal == "Axis0_Get_Encoder_Estimates: wrong length: 0 bytes came, the DBC says 8"
+    assert receiver.refusal == "Axis0_Get_Encoder_Estimates: wrong length: 0 bytes came, the DBC has 8"
 
 
 def test_the_state_is_what_the_heartbeat_says_until_it_is_too_old() -> None:

@@ -268,8 +268,8 @@ def test_bytes_may_be_off_by_half_a_step_and_by_what_floating_point_numbers_are_
 
 def test_the_message_s_other_signals_say_what_the_file_says() -> None:
     for mode in (4, 6, 13):
-        Guarded().refuses(by_hand(1.0, mode=mode), 1.0, f"Mode says {mode}, meant was 5")
-    Guarded().refuses(by_hand(1.0, gain=-7 & 0xFF), 1.0, "Gain says -3.5, meant was -3")
+        Guarded().refuses(by_hand(1.0, mode=mode), 1.0, f"Mode is {mode}, expected 5")
+    Guarded().refuses(by_hand(1.0, gain=-7 & 0xFF), 1.0, "Gain is -3.5, expected -3")
     for unused in (1, 8, 15):
         Guarded().refuses(by_hand(1.0, unused=unused), 1.0, "has a bit that no signal covers")
 
@@ -286,7 +286,7 @@ def test_a_counter_that_stays_or_leaps_is_refused_until_the_next_one_comes() -> 
 
 def test_a_frame_of_a_sequence_that_says_something_else_than_the_file_s_values_is_refused() -> None:
     constant = KNOWN.arm[0].frames[0]
-    for data, words in ((b"\x03\0", "Mode says 3, meant was 2"), (b"\x12\0", "no signal covers")):
+    for data, words in ((b"\x03\0", "Mode is 3, expected 2"), (b"\x12\0", "no signal covers")):
         it = Guarded()
         with pytest.raises(WireGuardError, match=words):  # whoever encoded it was wrong
             it.guard.constant(Frame(301, data), replace(constant, data=data))

@@ -41,7 +41,7 @@ HEADER = LogHeader(
     wall_offset_ns=WALL,
     simulated=True,
     dbc=LAYOUT.text,
-    messages=LAYOUT.known,
+    messages=LAYOUT.all_messages,
     metadata={"emb.run": {"iface": "sim", "argv": "emb-run --iface sim"}, "emb.truth": {"f_v": "2e-5"}},
     attachments=(Attachment("policy.onnx", "application/octet-stream", bytes(range(256)) * 400),),
 )

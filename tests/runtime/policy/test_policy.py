@@ -350,7 +350,7 @@ def test_what_no_policy_has_is_refused_before_onnx_runtime_sees_it(tmp_path: Pat
         ("another file", lambda m: m.graph.node.append(helper.make_node("Constant", [], ["c"], value=tensor))),
         ("control flow", lambda m: m.graph.node.append(helper.make_node("Loop", ["", ""], [], body=body))),
         ("control flow", lambda m: m.graph.node.append(helper.make_node("Add", [], ["c"], many=[body]))),
-        ("functions of its own", lambda m: m.functions.append(function)),
+        ("the policy has functions", lambda m: m.functions.append(function)),
         ("sparse tensors", lambda m: m.graph.sparse_initializer.append(sparse)),
         ("sparse tensors", lambda m: m.graph.node.append(helper.make_node("Constant", [], ["c"], sparse_value=sparse))),
         ("sparse tensors", lambda m: m.graph.node.append(helper.make_node("Constant", [], ["c"], many=[sparse]))),

@@ -77,8 +77,8 @@ def test_a_node_that_lies_meanwhile_does_not_drive_it_out_of_its_limits(lie: str
     [
         (math.nan, Fault.POLICY_NOT_FINITE, "it answered nan"),
         (-math.inf, Fault.POLICY_NOT_FINITE, "it answered nan"),
-        (1e9, Fault.POLICY_BEYOND_CONTRACT, "it asked for 2e+06 times what its contract allows"),
-        (-900.0, Fault.POLICY_BEYOND_CONTRACT, "it asked for 1.8 times what its contract allows"),
+        (1e9, Fault.POLICY_BEYOND_CONTRACT, "it requested 2e+06 times what its contract allows"),
+        (-900.0, Fault.POLICY_BEYOND_CONTRACT, "it requested 1.8 times what its contract allows"),
     ],
 )
 def test_a_speed_that_no_contract_allows_ends_the_run_by_the_stop_frame(

@@ -68,7 +68,7 @@ def test_whatever_happens_to_the_process_is_a_refusal_of_one_line(
         ("bytearray(1 << 30)", "takes more than 256 MiB of memory"),
         ("import ctypes; ctypes.string_at(0)", r"could not be tried: the trial process died \(signal 11\)"),
         ("import os; os._exit(0)", r"could not be tried: the trial process died \(exit status 0\)"),
-        ("import os; os.write(1, b'x' * (1 << 21))", "could not be tried: the trial process said more than"),
+        ("import os; os.write(1, b'x' * (1 << 21))", "could not be tried: the trial process wrote more than"),
     ):
         tried_with(tmp_path, monkeypatch, code)
         with pytest.raises(PolicyRefusedError, match=said) as refused:

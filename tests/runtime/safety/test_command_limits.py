@@ -43,7 +43,7 @@ def test_a_wish_may_pass_its_contract_by_a_millionth_of_rounding_and_no_more(sig
     assert caught.value.fault is Fault.POLICY_BEYOND_CONTRACT
     with pytest.raises(StopError) as caught:
         checked(sign * 4.5, 3.0)
-    assert caught.value.detail == "it asked for 1.5 times what its contract allows"
+    assert caught.value.detail == "it requested 1.5 times what its contract allows"
 
 
 @given(angles, velocities, st.floats(-9, 9), currents, steps)

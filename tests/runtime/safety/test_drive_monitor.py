@@ -33,7 +33,7 @@ class Account:
         if counter == NO_COUNTER:
             possible = abs(applied) <= LIMIT + TOLERANCE
             self.obeyed = [applied if possible else 0.0]  # where the next command's current begins
-            told = f"it reports {applied:.2f} A of its own braking, at most 6 A"
+            told = f"it reports {applied:.2f} A of its braking, at most 6 A"
             return "" if possible else self.bad(told)
         if counter in self.sent:
             self.obeyed.append(self.sent[counter])
@@ -42,7 +42,7 @@ class Account:
                 self.errors = max(self.errors - 1, 0)
                 return ""
             return self.bad(f"it reports {applied:.2f} A, commanded were {low:.2f} to {high:.2f} A")
-        return self.bad(f"it says that it obeyed command {counter}, which was never sent")
+        return self.bad(f"it reports that it obeyed command {counter}, which was never sent")
 
     def bad(self, told: str) -> str:
         """Five in a row are too many, and four good ones forgive a bad one."""

@@ -23,7 +23,7 @@ def test_what_is_no_answer_is_an_error_and_no_exception(monkeypatch: pytest.Monk
             return started([sys.executable, "-c", told], **keywords)
 
         monkeypatch.setattr(subprocess, "Popen", babbling)
-        with pytest.raises(ChildProcessError, match="the trial process said what is no answer"):
+        with pytest.raises(ChildProcessError, match="the trial process wrote what is no answer"):
             Child("trial", "none", {}, 60.0)
 
 
