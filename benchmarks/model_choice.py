@@ -88,7 +88,7 @@ def fitted(bench: Bench, plant: str, record: Experiment, truth: dict[str, float]
         found.best.name in alike,
         max(found.candidates, key=lambda c: c.held_out).name in alike,
         any(c.fits for c in found.candidates if c.name in alike),
-        any(c.name in alike for c in found.left_over),
+        any(c.name in alike for c in found.plausible),
         float(np.mean([low <= value <= high for (low, high), _, value in pairs])),
         float(np.mean([low <= value <= high for _, (low, high), value in pairs])),
         seconds,

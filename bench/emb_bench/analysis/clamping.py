@@ -5,11 +5,10 @@ friction T_s under it,
 
     current = γ F / k_m − current_offset,   friction = T_s / γ
 
-A current between (γ F − T_s)/k_m and (γ F + T_s)/k_m holds the force F: the force that belongs to a current is only
-known to ± friction. Each total is that of the estimate's total covariance C through the Jacobian D of the three,
-D C Dᵀ, so errors that the parameters share count with their signs: an error of J changes k_1 and k_m alike, and the
-current not at all. The angle is as the encoder counts it, from contact: an error of its scale changes k_m and T_c in C,
-and once more the angle.
+A current between (γ F − T_s)/k_m and (γ F + T_s)/k_m holds the force F: a current determines the force to ± friction.
+The totals follow from D C Dᵀ, with the estimate's total covariance C and the Jacobian D of the three. So errors common
+to the parameters count with their signs: an error of J changes k_1 and k_m alike, and the current not at all. The angle
+is the encoder's, from contact: an error of its scale changes k_m and T_c in C, and the angle besides.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.records import NORMAL_95
 from emb_runtime.config.bench import BrakeParameters
 
-NEEDED = ("k_m", "k_1", "T_c")  # Parameters without which the three are not known
+NEEDED = ("k_m", "k_1", "T_c")  # Parameters that the three depend on
 SCALE = "angle_scale"  # Entry of the budget that changes the angle
 
 
@@ -46,7 +45,7 @@ class Amount(NamedTuple):
     unit: str
 
     @property
-    def shown(self) -> tuple[float, tuple[float, float], str]:
+    def with_interval(self) -> tuple[float, tuple[float, float], str]:
         """Value, 95 % interval and unit."""
         return self.value, (self.value - self.total, self.value + self.total), self.unit
 
@@ -56,15 +55,15 @@ class Clamping(NamedTuple):
 
     angle: float  # As the encoder counts it from contact [rad]
     force: Amount  # At this angle
-    current: Amount  # In the middle of those that hold the force, as the node reports it
-    friction: Amount  # Half of the friction band: by how much the force may differ from that of the current
+    current: Amount  # Middle of the currents that hold the force, as reported by the node
+    friction: Amount  # Half of the friction band
 
 
 def clamping(e: Estimate, angle: float | None = None) -> Clamping | None:
-    """Clamping force at an angle [rad], without one at the largest measured one, to two digits.
+    """Clamping force at an angle [rad], by default the largest measured one, to two digits.
 
     Returns:
-        None for a machine that is no brake, without one of the parameters ``NEEDED``, or of a brake that never clamped.
+        None for a machine that is no brake, if a parameter of ``NEEDED`` is missing, or if the brake never clamped.
     """
     names = [unknown.name for unknown in e.unknowns]
     if e.bench.machine is not None or not {*NEEDED} <= {*names}:
@@ -80,8 +79,8 @@ def clamping(e: Estimate, angle: float | None = None) -> Clamping | None:
     covariance = jacobian[:, used] @ e.covariance()[np.ix_(used, used)] @ jacobian[:, used].T
     for one in e.validation.budget:
         if one.name == SCALE:  # the angle of a true one is smaller by it
-            moved, own = jacobian @ np.array(one.bias), -one.size * along
-            covariance += np.outer(moved, own) + np.outer(own, moved) + np.outer(own, own)
+            biased, direct = jacobian @ np.array(one.bias), -one.size * along
+            covariance += np.outer(biased, direct) + np.outer(direct, biased) + np.outer(direct, direct)
     totals = NORMAL_95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return Clamping(x, *map(Amount, values, totals.tolist(), ("N", "A", "N")))
 
@@ -100,7 +99,7 @@ def _largest(e: Estimate) -> float:
 
 
 def _w(m: Mechanics) -> float:
-    """The stop of a brake that is applied."""
+    """State of the play or hysteresis of a brake that is applied."""
     return stop_limit(m) if m.play > 0.0 or m.hysteresis > 0.0 else 0.0
 
 

@@ -1,10 +1,10 @@
 """Conclusion on each parameter: value, interval, identified or not.
 
-**What counts as identified**, here and in every command that estimates: the Fisher information identifies it
-(:mod:`emb_bench.information.criteria`), and its 95 % interval is closed, does not contain zero and does not come from
-an estimate at the border of the search. The interval is that of the likelihood profile where there is one
-(:func:`emb_bench.analysis.profile.profiles` decides where one is needed). Zero is excluded only of what is relative to
-its value; an angle or a delay may be zero.
+**Identified**, here and in every command that estimates, is a parameter that the Fisher information identifies
+(:mod:`emb_bench.information.identifiability`) with an estimate inside the search range and a closed 95 % interval
+without zero. The interval is that of the likelihood profile, if there is one
+(:func:`emb_bench.analysis.profile.profiles` selects the parameters that need one). Unknowns with a unit, such as an
+angle or a delay, may be zero.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from emb_bench.information.identifiability import GROSS, Doubt, Finding, Spectru
 from emb_runtime.config.bench import PARAMETER_NAMES
 
 PRECISE = 0.01
-"""Deviation, as a share of the value or of a gross error, above which a trade-off with another parameter is named."""
+"""Deviation, over the value or the gross error, above which a trade-off with another parameter is reported."""
 
 
 class Standing(StrEnum):
@@ -45,18 +45,18 @@ class Conclusion:
     """Conclusion on one parameter."""
 
     finding: Finding
-    """Of the Fisher information, with the doubts that the estimate adds; trade-offs only where they matter."""
+    """Finding of the Fisher information, with the doubts of the estimate; trade-offs above ``PRECISE``."""
     value: float  # In ``unit``
     unit: str  # SI, or of the machine that is no brake (:func:`emb_bench.brake.parameters.quantity`)
     interval: tuple[float, float]
-    """95 %: of the profile if output error has one and fits, else of the estimate; infinite where open. In ``unit``."""
+    """95 % interval by the rules of :mod:`emb_bench.estimate.intervals`, infinite where open. In ``unit``."""
     repeatability: float
-    """Half of the 95 % interval that the sensors' noise alone would leave: scatter of further runs. In ``unit``."""
+    """Half of the 95 % interval by the sensors' noise alone: scatter of further runs. In ``unit``."""
     of_interest: bool  # True if it is a parameter of interest, not a nuisance
     standing: Standing
     drift: Drift | None = None
     outside: tuple[float, float] | None = None
-    """Range, in ``unit``, for which the shield guarantees the limits, if the whole interval lies outside of it."""
+    """Range, in ``unit``, for which the shield guarantees the limits, if no part of the interval is in it."""
 
     @property
     def label(self) -> str:
@@ -76,30 +76,38 @@ def conclude(
     *,
     predicts: bool = True,
 ) -> tuple[Conclusion, ...]:
-    """Concludes on each unknown that was asked for; needs the profiles that :func:`profile.profiles` selects."""
-    findings = {finding.name: finding for finding in e.verdict().findings}
+    """Conclusions on the requested unknowns, with the profiles of :func:`profile.profiles`."""
+    findings = {finding.name: finding for finding in e.identifiability().findings}
     of_profile = {p.label: p for p in profiles}
     changes = {drift.name: drift for drift in drifts}
     certain = Standing.IDENTIFIED
     if not (e.validation.fits and predicts):
         certain = Standing.BIASED if e.method == "rls" else Standing.IF_MODEL_RIGHT
     found = []
-    columns = (e.unknowns, e.shown, e.labels, e.values.tolist(), e.intervals().tolist(), e.between_runs().tolist())
-    noise = (noise_deviations(e).tolist(), e.scale.tolist())
-    for unknown, shown, label, value, (low, high), deviation, own, scale in zip(*columns, *noise, strict=True):
-        if unknown.name in e.asked.along:
+    columns = (
+        e.unknowns,
+        e.quantities,
+        e.labels,
+        e.values.tolist(),
+        e.intervals().tolist(),
+        e.between_runs().tolist(),
+        noise_deviations(e).tolist(),
+        e.scale.tolist(),
+    )
+    for unknown, quantity, label, value, (low, high), deviation, noise, scale in zip(*columns, strict=True):
+        if unknown.name in e.question.default_nuisances:
             continue
         one, interval = of_profile.get(label), (low, high)
         if one is not None:
-            averaged = bool(e.asked.systematic) and one.agrees  # over errors that the profile has in full
-            holds, biased = e.validation.fits and e.method == "oem" and not averaged, bool(e.open().any())
+            averaged = bool(e.question.systematic) and one.agrees  # over errors whose priors the profile has in full
+            holds, biased = e.validation.fits and e.method == "oem" and not averaged, bool(e.unmodelled_bias().any())
             interval = with_profile(interval, one.interval, closed=one.doubt is None, holds=holds, biased=biased)
         interval = bounded(interval, value, least(unknown.name))
         gross = GROSS.get(unknown.name, 1.0)
         finding = findings.get(label)
         if finding is None:  # of a single experiment
             doubts = (Doubt.TOO_WIDE,) if deviation >= gross else ()
-            finding = Finding(label, deviation, doubts, unit="" if unknown.relative else shown.unit)
+            finding = Finding(label, deviation, doubts, unit="" if unknown.relative else quantity.unit)
         finding = replace(
             finding,
             doubts=finding.doubts + _further_doubts(e, unknown, label, interval, one, finding),
@@ -109,20 +117,20 @@ def conclude(
             Conclusion(
                 finding=finding,
                 value=value,
-                unit=shown.unit,
+                unit=quantity.unit,
                 interval=interval,
-                repeatability=NORMAL_95 * own * scale,
-                of_interest=unknown.name in e.asked.params,
+                repeatability=NORMAL_95 * noise * scale,
+                of_interest=unknown.name in e.question.params,
                 standing=certain if finding.identified else Standing.NOT_IDENTIFIED,
                 drift=changes.get(label),
-                outside=_range_left(e, unknown, interval),
+                outside=_range_missed(e, unknown, interval),
             )
         )
     return tuple(found)
 
 
-def _range_left(e: Estimate, unknown: Unknown, interval: tuple[float, float]) -> tuple[float, float] | None:
-    """Range of a parameter in the shield's set, SI units; None if some of the interval lies in it."""
+def _range_missed(e: Estimate, unknown: Unknown, interval: tuple[float, float]) -> tuple[float, float] | None:
+    """Range of a parameter in the shield's set [SI units]; None if a part of the interval is in it."""
     if e.bench.machine is not None or unknown.name not in PARAMETER_NAMES:
         return None
     ranges = e.bench.range_set(e.bench.shield.ranges)
@@ -133,8 +141,8 @@ def _range_left(e: Estimate, unknown: Unknown, interval: tuple[float, float]) ->
 def noise_deviations(e: Estimate) -> Floats:
     """Standard deviations by the sensors' noise alone, relative or in the unknown's unit; inf if not identified.
 
-    With the covariance C of the estimate and the information Λ of the samples, noise moves the estimate by the
-    covariance C Λ C: what a prior is about is the same in every run. No more than C, which is of the errors as well.
+    With the covariance C of the estimate and the information Λ of the samples, repeated runs scatter with C Λ C, for
+    the quantity with a prior is the same in every run. It is at most C, which includes the errors.
     """
     spectrum = Spectrum(e.information)
     variances = np.diag(spectrum.sandwich(e.samples))

@@ -1,11 +1,10 @@
 """Change of the parameters since an earlier estimate.
 
-Two estimates differ by chance, by as much as their deviations, of which errors that both share (inertia, scale of the
-angle, effects of the brake as far as they move both values alike) are no part; a parameter has drifted if it differs by
-more. With
-k parameters compared at once each has to pass the quantile for 1 - 0.05/k (Bonferroni), so that nothing is called a
-drift in 95 % of campaigns in which nothing has changed. A model that did not fit, or another one, moves parameters too:
-then the change is reported as one that may be the model's.
+A parameter has drifted if its change is significant against the deviations of both estimates. Errors common to both
+(inertia, scale of the angle, effects of the brake that bias both values alike) are no part of these deviations. Of k
+parameters each is tested at the level 0.05/k (Bonferroni), so that in 95 % of comparisons without a change no drift is
+reported. A model that does not fit, or another model, changes parameters as well; the report then adds that the change
+may be the model's.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from emb_bench.logs.estimates import LONG, read_document
 from emb_runtime.errors import UsageError
 from emb_runtime.system.terminal import one_line
 
-LEVEL = 0.05  # Chance that anything at all is called a drift where there is none
+LEVEL = 0.05  # False-alarm probability of all parameters together
 SMALLEST = 1e-200  # Smallest value that another one is compared with relatively
 
 
@@ -106,15 +105,15 @@ def earlier(e: Estimate, record: str) -> Earlier:
     between = e.between_runs().tolist()
     entries = {
         e.labels[i]: Entry(float(e.values[i]), e.unknowns[i].relative, between[i], dict(e.effects(i)))
-        for i in e.wanted()
+        for i in e.requested()
     }
     return Earlier(entries, e.plant.name, e.validation.fits, (Named(record),))
 
 
 def drifts(now: Estimate, last: Earlier) -> tuple[Drift, ...]:
-    """Compare what all records share with an earlier estimate, as far as both have it."""
+    """Compare the shared unknowns with those of an earlier estimate, as far as both have them."""
     then = last.parameters
-    common = [i for i in now.shared() if i in now.wanted() and now.labels[i] in then]
+    common = [i for i in now.shared() if i in now.requested() and now.labels[i] in then]
     if not common:
         raise UsageError(
             f"nothing to compare: the earlier estimate is of {one_line(', '.join(then), LONG)}, this one of "
@@ -125,14 +124,14 @@ def drifts(now: Estimate, last: Earlier) -> tuple[Drift, ...]:
     deviations = now.between_runs()
     found = []
     for i in common:
-        name, relative, unit = now.labels[i], now.unknowns[i].relative, now.shown[i].unit
+        name, relative, unit = now.labels[i], now.unknowns[i].relative, now.quantities[i].unit
         value = float(now.values[i])
         deviation = float(deviations[i]) * (abs(value) if relative else 1.0)
         before, deviation_before = then[name].value, then[name].absolute
-        own = {effect: (float(now.scale[i]) * bias, size) for effect, (bias, size) in now.effects(i).items()}
+        effects = {effect: (float(now.scale[i]) * bias, size) for effect, (bias, size) in now.effects(i).items()}
         other = {effect: (then[name].unit * bias, size) for effect, (bias, size) in then[name].effects.items()}
-        in_both = {effect: one for effect, one in other.items() if effect in own}
-        both = math.hypot(apart_by(deviation, own, other), apart_by(deviation_before, other, in_both))
+        in_both = {effect: one for effect, one in other.items() if effect in effects}
+        both = math.hypot(apart_by(deviation, effects, other), apart_by(deviation_before, other, in_both))
         change = value - before
         size = abs(before) if relative else 1.0
         sigmas = change / both if 0.0 < both < math.inf else 0.0

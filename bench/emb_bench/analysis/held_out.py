@@ -1,11 +1,10 @@
-"""Prediction of an experiment that the estimate has not seen, and parameters in which experiments differ.
+"""Prediction of an experiment from an estimate of others, and parameters in which experiments differ.
 
-Residuals of what was estimated from are smaller than the noise, and a flexible model bends to them. The error of a
-prediction is noise plus the error of the parameters: with the estimate's covariance C and the sensitivities J,
-e^T (I + J C J^T)⁻¹ e is χ² with as many degrees of freedom as there are samples. It is the least of |e|² + δ^T C⁻¹ δ
-over the parameters' errors δ, and that is how it is computed here, by simulation instead of J: the curvature of
-the model counts. Each combination that is not identified, and each unknown of the new experiment alone, costs a degree
-of freedom.
+In-sample residuals are smaller than the noise, most of all with a flexible model. The error e of a prediction is noise
+plus the error of the parameters: with the estimate's covariance C and the sensitivities J, e^T (I + J C J^T)⁻¹ e is χ²
+with as many degrees of freedom as samples. It equals the minimum of |e|² + δ^T C⁻¹ δ over the parameters' errors δ,
+which is computed here by simulation, without linearisation. Each combination that is not identified, and each unknown
+of the new experiment alone, costs a degree of freedom.
 """
 
 from __future__ import annotations
@@ -32,26 +31,26 @@ from emb_bench.estimate.windows import predict_windows
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.errors import UsageError
 
-APART = 0.001  # Chance that a parameter of one and the same brake is said to differ, for all parameters together
-LEVEL = 0.01  # Chance of a false alarm with the right model, for all predictions together
+APART = 0.001  # False-alarm probability of differing parameters, all parameters together
+LEVEL = 0.01  # False-alarm probability of all predictions together
 
-GROUPS = 4  # Most estimates that leave experiments out: the time grows with their number, not with its square
-_DETERMINED = 1e-7  # share of the largest singular value, columns of unit length, from which a direction is determined
+GROUPS = 4  # Folds of the cross-validation: the time grows linearly with the number of experiments
+_DETERMINED = 1e-7  # of the largest singular value, columns of unit length, above which a direction is determined
 
 
 def held_out(e: Estimate, experiment: Experiment, *, among: int = 1) -> HeldOut:
-    """Predict an experiment of the same brake from an estimate of others; ``among`` predictions share false alarms."""
+    """Predict an experiment of the same brake from an estimate of others; ``among``: number of predictions tested."""
     level = LEVEL / among
     if e.method == "windows":
         return _windows_predicted(e, experiment, level)
-    problem = replace(e.problem, asked=replace(e.asked, prior=None), experiments=(experiment,))
+    problem = replace(e.problem, question=replace(e.question, prior=None), experiments=(experiment,))
     index = [i for i, unknown in enumerate(problem.unknowns) if unknown.experiment is None]
     start = problem.nominal()
     start[index] = e.z[e.shared()]
     start = np.clip(start, *problem.bounds)
     at = start[index]
-    known = np.zeros((len(index), len(start)))
-    known[:, index] = _root(e.shared_information())
+    prior = np.zeros((len(index), len(start)))
+    prior[:, index] = _root(e.shared_information())
     weights = problem.weights(start)
     if experiment.gap_unknowns and e.method != "pem":
         problem = searched(problem, [start]).problem
@@ -59,14 +58,14 @@ def held_out(e: Estimate, experiment: Experiment, *, among: int = 1) -> HeldOut:
 
     def residuals(z: Floats) -> tuple[Floats, Floats]:
         errors, rows = parts(z)
-        return np.concatenate([errors, known[:, index] @ (z[index] - at)]), np.concatenate([rows, known])
+        return np.concatenate([errors, prior[:, index] @ (z[index] - at)]), np.concatenate([rows, prior])
 
     end = minimise(problem, start, residuals)
     rows = residuals(end.z)[1]
-    fitted = _rank(rows) - _rank(known)
+    fitted = _rank(rows) - _rank(prior)
     samples = int(sum((root > 0.0).sum() for root in weights))
     measured = sum(root.size for root in weights)
-    starts = len(rows) - len(known) - measured
+    starts = len(rows) - len(prior) - measured
     if e.method != "pem":
         starts -= experiment.gap_unknowns
         fitted += taken(problem.gap_basis(end.z, weights), measured)
@@ -75,23 +74,19 @@ def held_out(e: Estimate, experiment: Experiment, *, among: int = 1) -> HeldOut:
     return HeldOut(experiment.name, end.cost, freedom, p_value, p_value >= level)
 
 
-def refit(e: Estimate, chosen: Sequence[int]) -> Estimate:
-    """Estimates again from some of the experiments, any of them as often as it is to count, by the same method.
+def refit(e: Estimate, index: Sequence[int]) -> Estimate:
+    """Estimate from the experiments ``index``, which may repeat, by the same method.
 
-    Output error begins where the estimate is. The model validation is not repeated: it is that of the first estimate.
+    Output error begins at the estimate ``e``. The model validation is that of ``e``.
     """
-    problem, own = e.problem.part(chosen)
+    problem, places = e.problem.subset(index)
     if e.method != "oem":
-        return method_of(e.method)(e.bench, e.plant, e.asked, starts=1).fit(problem.experiments)
-    return searched(problem, [np.clip(e.z[own], *problem.bounds)]).finished(e.validation)
+        return method_of(e.method)(e.bench, e.plant, e.question, starts=1).fit(problem.experiments)
+    return searched(problem, [np.clip(e.z[places], *problem.bounds)]).finished(e.validation)
 
 
 def leave_one_out(e: Estimate) -> tuple[HeldOut, ...]:
-    """Predict each experiment from an estimate of others, made by the same method.
-
-    Of up to ``GROUPS`` experiments these are all others; of more, those that are not in its group, of ``GROUPS`` in
-    turns.
-    """
+    """Cross-validation in ``GROUPS`` folds: each experiment is predicted from an estimate of the others."""
     count = len(e.experiments)
     if count < 2:
         raise UsageError(f"to predict each record from the others takes at least 2, got {count}")
@@ -101,9 +96,9 @@ def leave_one_out(e: Estimate) -> tuple[HeldOut, ...]:
 
 
 def _windows_predicted(e: Estimate, experiment: Experiment, level: float) -> HeldOut:
-    """Prediction of the windows of an experiment, each from the start that fits it best.
+    """Prediction of the windows of an experiment, each from its best start.
 
-    What a window was disturbed by is not in the parameters, so that their uncertainty is not released.
+    The uncertainty of the parameters does not count: disturbances of the windows exceed it.
     """
     error, chi2, freedom = predict_windows(replace(e.problem, experiments=(experiment,)), e.values)
     p_value = float(special.chdtrc(freedom, chi2))
@@ -113,7 +108,7 @@ def _windows_predicted(e: Estimate, experiment: Experiment, level: float) -> Hel
 def _errors(
     e: Estimate, problem: Problem, z: Floats, weights: Sequence[Floats]
 ) -> Callable[[Floats], tuple[Floats, Floats]]:
-    """Errors of the simulation, or of the filter where the estimate is one of innovations."""
+    """Errors of the simulation, or of the filter for the prediction-error method."""
     if e.method != "pem":
         return lambda z: problem.jacobian(z, weights)
     filtered = Filter(problem, e.process_noise, e.load_noise)
@@ -125,8 +120,8 @@ def _root(information: Floats) -> Floats:
     """R with R^T R = M, a row of zeros for each direction that is not identified, shape (p, p)."""
     unit = np.sqrt(np.where(np.diag(information) > 0.0, np.diag(information), 1.0))
     values, vectors = np.linalg.eigh(information / np.outer(unit, unit))
-    kept = np.where(values > _DETERMINED**2 * len(unit), values, 0.0)
-    result: Floats = np.sqrt(kept)[:, None] * vectors.T * unit
+    determined = np.where(values > _DETERMINED**2 * len(unit), values, 0.0)
+    result: Floats = np.sqrt(determined)[:, None] * vectors.T * unit
     return result
 
 
@@ -136,19 +131,21 @@ def _rank(rows: Floats) -> int:
 
 
 def apart(e: Estimate) -> tuple[Differing, ...]:
-    """Parameters in which the experiments of an estimate differ that each fit alone; the most different first.
+    """Parameters that differ between experiments, each of which fits alone; the most different first.
 
-    Empty if they fit together, if no more than half of them fit alone, or if no parameter differs. An experiment that
-    does not fit alone is not compared: of many right ones, one raises a false alarm.
+    Empty if the experiments fit together, if no more than half of them fit alone, or if no parameter differs.
+    Experiments that do not fit alone are not compared.
     """
     if len(e.experiments) < 2 or e.validation.fits:
         return ()
-    every = [method_of(e.method)(e.bench, e.plant, e.asked, starts=1).fit([experiment]) for experiment in e.experiments]
+    every = [
+        method_of(e.method)(e.bench, e.plant, e.question, starts=1).fit([experiment]) for experiment in e.experiments
+    ]
     alone = [one for one in every if one.validation.fits]
     if 2 * len(alone) <= max(len(every), 2):
         return ()
     found = []
-    for name in e.asked.params:
+    for name in e.question.params:
         at = [next(i for i, u in enumerate(one.unknowns) if u.name == name) for one in alone]
         values = np.array([one.values[i] for one, i in zip(alone, at, strict=True)])
         effects = [one.effects(i) for one, i in zip(alone, at, strict=True)]
@@ -156,10 +153,10 @@ def apart(e: Estimate) -> tuple[Differing, ...]:
         between = [float(one.between_runs()[i]) for one, i in zip(alone, at, strict=True)]
         if not np.isfinite(between).all():
             continue
-        deviations = [apart_by(d, own, mean) for d, own in zip(between, effects, strict=True)]
+        deviations = [apart_by(d, one, mean) for d, one in zip(between, effects, strict=True)]
         scale = float(np.mean([one.scale[i] for one, i in zip(alone, at, strict=True)]))
         p_value = constancy(values.tolist(), [scale * d for d in deviations]).p_value
-        if p_value < APART / len(e.asked.params):
+        if p_value < APART / len(e.question.params):
             in_order = iter(values.tolist())
             by_experiment = tuple(next(in_order) if one.validation.fits else math.nan for one in every)
             found.append(Differing(quantity(e.bench.machine, name).name, by_experiment, p_value))

@@ -1,14 +1,13 @@
-"""Growth of a model: features that the experiments ask for, added one by one to a simple plant.
+"""Stepwise growth of a model: significant features are added one by one to a simple plant.
 
-In each round Rao's score test asks of every feature that the model lacks how much of it the residuals want. Those that
-they want are fitted. The one with the least BIC is added if that is less than before and what was held out is predicted
-no worse; a feature that became needless by it is taken out again. It ends when nothing more is wanted, or accepted.
+Each round fits every missing feature with a significant score test (Rao). The fit with the least BIC is added if BIC
+falls and the held-out prediction is no worse; then features that BIC no longer supports are removed. It ends when no
+feature is significant, or none is accepted.
 
-Who looks at many features finds one by chance: BIC is that of Chen and Chen (Biometrika 95, 2008), with 2 log of the
-number of models with as many additions besides. Score tests are of first order: where the residuals are large they say
-what to try, not how much of it there is. Friction that differs by the direction of motion is no addition of its own,
-for it is the same torque as an offset of the current; and the clamping force's curve is added with both of its terms,
-for with one of them alone its slope at contact would seem better known than it is.
+Multiple testing: BIC is that of Chen and Chen (Biometrika 95, 2008), with 2 log of the number of models with as many
+additions. Score tests are linear: with large residuals they select features, but do not size them. Friction that
+differs by the direction of motion is no addition, for it is the same torque as an offset of the current. The clamping
+force's curve is added with both of its terms: with one of them alone the slope at contact would be overconfident.
 """
 
 from __future__ import annotations
@@ -38,52 +37,60 @@ ADDITIONS: Mapping[str, tuple[str, ...]] = {
     if row.addition
 }
 """Possible additions, and the unknowns of each."""
-WANTED = 3.0  # Standard deviations of the score from which on an addition is tried
-FOLLOWED = 10.0  # χ²/n from which on a search is led by a filter that follows the measured brake
-POLISHED = 6  # Searches around the minimum of a model that was accepted,
+SIGNIFICANT = 3.0  # Score above which an addition is tried [standard deviations]
+FOLLOWED = 10.0  # χ²/n above which a search is repeated by continuation
+POLISHED = 6  # Searches around the minimum of an accepted model,
 AROUND = 0.03  # from values that differ by this share
 
 
 def grow_model(
-    bench: Bench, plant: Plant, experiments: Sequence[Experiment], asked: EstimationProblem, *, starts: int, seed: int
+    bench: Bench,
+    plant: Plant,
+    experiments: Sequence[Experiment],
+    question: EstimationProblem,
+    *,
+    starts: int,
+    seed: int,
 ) -> Estimate:
-    """Adds features to a plant until the experiments ask for nothing more; the estimate's plant is named after them."""
+    """Adds features to a plant until none is significant; the estimate's plant is named after them."""
     if plant.mechanics.solver != EXACT:
         raise UsageError(f"plant '{plant.name}': expected one that is solved exactly: others have no features to add")
-    first = method_of("oem")(bench, plant, asked, starts=starts, seed=seed).fit(experiments)
-    now = _judged(plant, first, ())
+    first = method_of("oem")(bench, plant, question, starts=starts, seed=seed).fit(experiments)
+    now = _grown(plant, first, ())
     added: tuple[str, ...] = ()
     seen: dict[tuple[str, ...], Candidate] = {(): now}
     path = [added]
     while True:
-        scores = wanted(now.estimate, added)
-        tried = [name for name in scores if abs(scores[name]) >= WANTED and _possible(plant, asked, (*added, name))]
+        scores = addition_scores(now.estimate, added)
+        tried = [
+            name for name in scores if abs(scores[name]) >= SIGNIFICANT and _possible(plant, question, (*added, name))
+        ]
         for name in tried:
             key = _key((*added, name))
             if key not in seen:
-                seen[key] = _fitted(plant, asked, now.estimate, key)
+                seen[key] = _fitted(plant, question, now.estimate, key)
         found = [(name, seen[_key((*added, name))]) for name in tried]
         better = [(name, c) for name, c in found if c.bic < now.bic and c.held_out >= now.held_out]
         if not better:
             break
         newest, best = min(better, key=lambda pair: pair[1].bic)
         added = _key((*added, newest))
-        now = seen[added] = _polished(plant, asked, best, added, seed)
-        now, added = _pruned(plant, asked, now, added, seen, newest)
+        now = seen[added] = _polished(plant, question, best, added, seed)
+        now, added = _pruned(plant, question, now, added, seen, newest)
         if added in path:
             break
         path.append(added)
-    # Of those that have less BIC what was held out is predicted worse.
+    # Models with less BIC predict the held-out part worse.
     return ranked([c for c in seen.values() if c.bic >= now.bic or c is now]).best.estimate
 
 
-def wanted(e: Estimate, added: Sequence[str] = ()) -> dict[str, float]:
-    """Scores of all additions that the model lacks, in standard deviations, most wanted first."""
+def addition_scores(e: Estimate, added: Sequence[str] = ()) -> dict[str, float]:
+    """Scores of all additions that the model lacks [standard deviations], most significant first."""
     scores = {suspect.name: suspect.sigmas for suspect in e.validation.suspects}
     found = {
         name: scores[unknowns[0]]
         for name, unknowns in ADDITIONS.items()
-        if name not in added and unknowns[0] in scores and _possible(e.plant, e.asked, (name,))
+        if name not in added and unknowns[0] in scores and _possible(e.plant, e.question, (name,))
     }
     return dict(sorted(found.items(), key=lambda pair: -abs(pair[1])))
 
@@ -92,67 +99,69 @@ def _key(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in ADDITIONS if name in names)
 
 
-def _with(asked: EstimationProblem, names: Sequence[str]) -> EstimationProblem:
-    unknowns = [unknown for name in names for unknown in ADDITIONS[name] if unknown not in asked.names]
-    return replace(asked, nuisances=(*asked.nuisances, *unknowns))
+def _with(question: EstimationProblem, names: Sequence[str]) -> EstimationProblem:
+    unknowns = [unknown for name in names for unknown in ADDITIONS[name] if unknown not in question.names]
+    return replace(question, nuisances=(*question.nuisances, *unknowns))
 
 
-def _possible(plant: Plant, asked: EstimationProblem, names: Sequence[str]) -> bool:
+def _possible(plant: Plant, question: EstimationProblem, names: Sequence[str]) -> bool:
     try:
-        check_model(plant, _with(asked, names).names)
+        check_model(plant, _with(question, names).names)
     except UsageError:
         return False
     return True
 
 
-def _problem(plant: Plant, asked: EstimationProblem, near: Estimate, names: Sequence[str]) -> Problem:
-    """Problem with additions; what they leave no room for is no longer estimated too: a delay beside a lag."""
-    found = _with(asked, names)
+def _problem(plant: Plant, question: EstimationProblem, near: Estimate, names: Sequence[str]) -> Problem:
+    """Problem with additions, without systematic errors that they exclude: a delay beside a lag."""
+    found = _with(question, names)
     if found.systematic:
         found = with_systematic(found, near.bench, plant)
     return Problem(near.bench, plant, found, near.experiments)
 
 
-def _judged(plant: Plant, e: Estimate, added: Sequence[str]) -> Candidate:
+def _grown(plant: Plant, e: Estimate, added: Sequence[str]) -> Candidate:
     name = " + ".join((plant.name, *added))
     found = candidate(name, replace(e, problem=replace(e.problem, plant=replace(e.plant, name=name))))
     return replace(found, bic=found.bic + 2.0 * math.log(math.comb(len(ADDITIONS), len(added))))
 
 
-def _fitted(plant: Plant, asked: EstimationProblem, near: Estimate, names: Sequence[str]) -> Candidate:
-    problem = _problem(plant, asked, near, names)
+def _fitted(plant: Plant, question: EstimationProblem, near: Estimate, names: Sequence[str]) -> Candidate:
+    problem = _problem(plant, question, near, names)
     fit = fit_from(problem, near)
     if fit.ratio > FOLLOWED:
         fit = min(fit, fit_from(problem, near, follow=True), key=lambda one: one.best.cost)
-    return _judged(plant, fit.finished(), names)
+    return _grown(plant, fit.finished(), names)
 
 
-def _polished(plant: Plant, asked: EstimationProblem, found: Candidate, names: Sequence[str], seed: int) -> Candidate:
-    """The model searched once more from around its minimum, in case that is a local one."""
+def _polished(
+    plant: Plant, question: EstimationProblem, found: Candidate, names: Sequence[str], seed: int
+) -> Candidate:
+    """The model searched again from points around its minimum, which may be a local one."""
     e, rng = found.estimate, np.random.default_rng(seed)
-    problem = _problem(plant, asked, e, names)
+    problem = _problem(plant, question, e, names)
     around = [e.values * (1.0 + AROUND * rng.standard_normal(len(e.z))) for _ in range(POLISHED)]
     near = [replace(e, z=e.problem.coordinates(values)) for values in around]
     fits = [fit_from(problem, e, follow=True), *(fit_from(problem, start) for start in near)]
     best = min(fits, key=lambda fit: fit.best.cost)
-    return _judged(plant, best.finished(), names) if best.best.cost < e.ends[0].cost - 1e-3 else found
+    return _grown(plant, best.finished(), names) if best.best.cost < e.ends[0].cost - 1e-3 else found
 
 
 def _pruned(
     plant: Plant,
-    asked: EstimationProblem,
+    question: EstimationProblem,
     now: Candidate,
     added: tuple[str, ...],
     seen: dict[tuple[str, ...], Candidate],
     newest: str,
 ) -> tuple[Candidate, tuple[str, ...]]:
-    """The model without earlier additions that BIC does not miss."""
+    """The model without earlier additions that BIC does not support."""
     for name in added:
         less = tuple(other for other in added if other != name)
         if name == newest or not less:
             continue
         if less not in seen:
-            seen[less] = _fitted(plant, asked, now.estimate, less)
+            seen[less] = _fitted(plant, question, now.estimate, less)
         if seen[less].bic <= now.bic:
             now, added = seen[less], less
     return now, added

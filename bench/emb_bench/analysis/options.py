@@ -1,4 +1,4 @@
-"""Options of what is asked about a brake: of an information, an estimate, a report, a campaign."""
+"""Options of an information, an estimate, a report, an export: a record for each command."""
 
 from __future__ import annotations
 
@@ -64,13 +64,13 @@ class QuestionOptions(Options):
         return params, nuisances
 
     def question(self, bench: Bench) -> Question:
-        """The unknowns, and what is known of them before."""
+        """The unknowns and their prior."""
         return Question(*self.names_on(bench), None if self.prior is None else bench.range_set(self.prior))
 
 
 @dataclass(frozen=True, eq=False)
 class SearchOptions(QuestionOptions):
-    """A question, and the searches for its answer."""
+    """Unknowns, and the searches for them."""
 
     starts: int = option(STARTS, "local searches (default: 8)", "N", kind=int, least=1)
     seed: int = option(0, "seed of the starts of these searches (default: 0)", "N", kind=int, least=0)
@@ -122,12 +122,12 @@ class FitOptions(SearchOptions):
         """The unknowns of a plant, with the systematic errors that it can have where they are estimated too."""
         from emb_bench.estimate.effects import with_systematic
 
-        question, known = self.question(bench), known_values(self.known)
-        asked = EstimationProblem(**vars(question), known=known, window=self.window)
-        if unasked := [name for name in known if name not in asked.names]:
-            raise UsageError(f"--known {', '.join(unasked)}: expected one of {', '.join(asked.names)}")
-        asked = freed(asked, bench)
-        return with_systematic(asked, bench, plant) if self.systematic == "bench" else asked
+        priors = known_values(self.known)
+        problem = EstimationProblem(**vars(self.question(bench)), known=priors, window=self.window)
+        if no_unknowns := [name for name in priors if name not in problem.names]:
+            raise UsageError(f"--known {', '.join(no_unknowns)}: expected one of {', '.join(problem.names)}")
+        problem = freed(problem, bench)
+        return with_systematic(problem, bench, plant) if self.systematic == "bench" else problem
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,9 +185,9 @@ class ReportOptions(EstimateOptions):
     def __post_init__(self) -> None:
         """Refuse what needs one estimate beside a comparison of two."""
         super().__post_init__()
-        asked = [f"--{name}" for name in ("last", "acceptance", "junit") if getattr(self, name) is not None]
-        if self.compare and asked:
-            raise UsageError(f"--compare: expected it without {' and '.join(asked)}: report each run alone for these")
+        refused = [f"--{name}" for name in ("last", "acceptance", "junit") if getattr(self, name) is not None]
+        if self.compare and refused:
+            raise UsageError(f"--compare: expected it without {' and '.join(refused)}: report each run alone for these")
 
 
 def names_of(names: Names) -> tuple[str, ...]:
@@ -197,7 +197,7 @@ def names_of(names: Names) -> tuple[str, ...]:
 
 
 def known_values(given: Names | None) -> dict[str, tuple[float, float]]:
-    """Value and standard deviation of each known parameter, SI units, as ``--known`` has them."""
+    """Value and standard deviation of each parameter of ``--known`` [SI units]."""
     found = {}
     for text in () if given is None else names_of(given):
         parts = re.fullmatch(rf"(\w+)=({NUMBER})(?:±|\+-)({NUMBER})(%?)", text)

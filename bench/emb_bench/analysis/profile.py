@@ -1,11 +1,11 @@
 """Likelihood profiles: rise of χ² over one unknown, with all the others refitted at each of its values.
 
 The Fisher information is a parabola at the estimate; a profile follows the likelihood itself, however curved, up to
-the border of what is searched (Raue et al., Structural and practical identifiability analysis of partially observed
-dynamical models by exploiting the profile likelihood, Bioinformatics 25, 2009, section 2.2). The unknown is held at
+the border of the search (Raue et al., Structural and practical identifiability analysis of partially observed
+dynamical models by exploiting the profile likelihood, Bioinformatics 25, 2009, section 2.2). The unknown is fixed at
 points of a grid that begins at the minimum and widens while the rise is small; at each the others are refitted, from an
-extrapolation of the last points. The likelihood is that of output error, all priors in full, for an estimate by any
-method.
+extrapolation of the last points. For an estimate by any method the likelihood is that of output error, with all priors
+in full.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ SHARE = 0.05  # Largest first distance from the minimum, as a share of the way t
 SMALL, LARGE = 0.1, 2.5
 """Rise from one point of the grid to the next below which the grid widens, and above which it narrows."""
 SEARCHES = 60  # Most searches on one side
-BETTER = 0.01  # Fall of χ² below its minimum that is more than the search's own error
+BETTER = 0.01  # Fall of χ² below its minimum that exceeds the error of the search
 MINIMA = 3  # Most minima that a profile moves on to
-CLIFF = 1e-9  # Share of the way to the border that the grid is not narrowed below: the rise jumps there
+CLIFF = 1e-9  # Least step, over the way to the border: a larger rise than ``LARGE`` is then a jump
 DOUBTFUL = 0.05
-"""Deviation, as a share of the value or of a gross error, above which a parabola is not trusted without a profile."""
+"""Deviation, over the value or the gross error, above which the Gaussian approximation is doubtful."""
 
 
 class _Point(NamedTuple):
@@ -56,17 +56,17 @@ class _Side(NamedTuple):
 
 
 def profiles(e: Estimate, *, of_all: bool) -> tuple[Profile, ...]:
-    """Profiles of the unknowns that all experiments share; unless ``of_all``, of those whose verdict may depend on one.
+    """Profiles of the shared requested unknowns: ``of_all``, or only if the Gaussian approximation is doubtful.
 
-    No verdict does if the parabola of the Fisher information holds for all of them inside the search range. Otherwise
-    the curvature may affect each; an unknown that the information does not identify is not identified either way.
+    If it is doubtful for one of them, the curvature may affect each. An unknown that the information does not identify
+    needs no profile for its verdict.
     """
-    chosen = [i for i in e.shared() if i in e.wanted()]
+    index = [i for i in e.shared() if i in e.requested()]
     if not of_all:
-        unidentified = {finding.name for finding in e.verdict().findings if not finding.identified}
-        bent = any(_bent(e, i) for i in chosen)
-        chosen = [i for i in chosen if bent and e.labels[i] not in unidentified]
-    return tuple(profile(e, e.labels[i]) for i in chosen)
+        unidentified = {finding.name for finding in e.identifiability().findings if not finding.identified}
+        bent = any(_bent(e, i) for i in index)
+        index = [i for i in index if bent and e.labels[i] not in unidentified]
+    return tuple(profile(e, e.labels[i]) for i in index)
 
 
 def _bent(e: Estimate, i: int) -> bool:
@@ -132,29 +132,29 @@ def _sides(e: Estimate, problem: Problem, weights: Sequence[Floats], i: int, min
 def _walk(
     problem: Problem, weights: Sequence[Floats], i: int, z: Floats, cost: float, border: float, step: float
 ) -> _Side:
-    """Hold unknown ``i`` at values from the minimum ``z`` to the border, until the rise is enough."""
-    stay = np.eye(len(z))[i : i + 1]
+    """Fix unknown ``i`` at values from the minimum ``z`` towards the border, until the rise reaches ``LEVEL``."""
+    unit_row = np.eye(len(z))[i : i + 1]
 
-    def held(z: Floats) -> tuple[Floats, Floats]:
+    def with_fixed(z: Floats) -> tuple[Floats, Floats]:
         residuals, rows = problem.jacobian(z, weights)
-        rows[:, i] = 0.0  # nothing follows from moving it but an error that is zero where it is: it stays
-        return np.append(residuals, 0.0), np.concatenate([rows, stay])
+        rows[:, i] = 0.0  # fixes unknown i: a zero column and a unit row
+        return np.append(residuals, 0.0), np.concatenate([rows, unit_row])
 
     points = [_Point(z, 0.0)]
     for _ in range(SEARCHES):
         here, rise = points[-1]
-        left = border - float(here[i])
-        if left == 0.0 or step <= 0.0:
+        distance = border - float(here[i])
+        if distance == 0.0 or step <= 0.0:
             break
-        move = math.copysign(min(step, abs(left)), left)
+        move = math.copysign(min(step, abs(distance)), distance)
         if here[i] + move == here[i]:  # at the border, but for rounding
             break
         start = here.copy()
         if len(points) > 1:  # extrapolated along the last step
             before = points[-2].z
             start += (here - before) * (move / (here[i] - before[i]))
-        start[i] = border if move == left else here[i] + move
-        end = minimise(problem, np.clip(start, *problem.bounds), held)
+        start[i] = border if move == distance else here[i] + move
+        end = minimise(problem, np.clip(start, *problem.bounds), with_fixed)
         found = end.z
         found[i] = start[i]  # a search begins strictly inside its bounds
         grown = end.cost - cost - rise

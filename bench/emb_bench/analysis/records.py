@@ -17,15 +17,15 @@ from emb_bench.information.identifiability import Doubt
 LEVEL = NORMAL_95**2
 """Rise of χ² that one parameter stays below in 95 % of experiments: a quantile of χ² with one degree of freedom."""
 AGREES = 0.1  # Largest relative difference of two half-widths that count as equal
-NEGLIGIBLE = 0.01  # Weight below which a model adds nothing to an interval
+NEGLIGIBLE = 0.01  # Weight below which a model does not count in an interval
 
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Likelihood profile of one unknown: rise of χ² when it is held and the others are refitted."""
+    """Likelihood profile of one unknown: rise of χ² with it fixed and the others refitted."""
 
     label: str
-    values: Floats  # Values of the held unknown, ascending, SI units, shape (n,)
+    values: Floats  # Values of the unknown, ascending [SI units], shape (n,)
     rise: Floats  # χ² above its minimum, prior included, shape (n,)
     interval: tuple[float, float]
     """95 % by the likelihood ratio; infinite on a side where the rise does not reach ``LEVEL``."""
@@ -46,10 +46,10 @@ class Profile:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Prediction of an experiment that the estimate has not seen."""
+    """Prediction of a held-out experiment."""
 
     name: str
-    chi2: float  # Weighted square of the prediction's errors, the uncertainty of the estimate taken into account
+    chi2: float  # Squares of the prediction's errors, weighted by noise and the uncertainty of the estimate
     freedom: int
     p_value: float  # Chance of a larger one if the model is right
     fits: bool
@@ -67,7 +67,7 @@ class Differing:
 
     name: str
     values: tuple[float, ...]
-    """By each experiment alone, in their order, in the unit that they are shown in; NaN by one that does not fit."""
+    """By each experiment alone, in their order, in the unit of the output; NaN if it does not fit."""
     p_value: float  # Chance of such differences if it is the same (χ² of the values around their weighted mean)
 
 
@@ -75,12 +75,12 @@ class Differing:
 class Candidate:
     """A fitted model."""
 
-    name: str  # Of the plant, or what was added to it
+    name: str  # Of the plant and the features added to it
     estimate: Estimate = field(repr=False)
     deviance: float  # −2 log L, but for a constant that all models share
     bic: float
-    held_out: float  # Logarithm of the density of what was held out, but for a constant that all models share
-    weight: float = 0.0  # Share of it in the answer
+    held_out: float  # Log predictive density of the held-out part, without a constant that all models share
+    weight: float = 0.0  # Posterior probability by BIC
 
     @property
     def fits(self) -> bool:
@@ -103,7 +103,7 @@ class ModelChoice:
 
     candidates: tuple[Candidate, ...]
     same: tuple[str, ...] = ()
-    """Plants that are left out: one that fits better is the same but for an offset that is estimated too."""
+    """Plants without a rank: one that fits better differs only by an offset that is estimated."""
 
     @property
     def best(self) -> Candidate:
@@ -111,8 +111,8 @@ class ModelChoice:
         return self.candidates[0]
 
     @property
-    def left_over(self) -> tuple[Candidate, ...]:
-        """Models that the experiments do not tell from the best one."""
+    def plausible(self) -> tuple[Candidate, ...]:
+        """Models whose weight counts."""
         return tuple(c for c in self.candidates if c.weight >= NEGLIGIBLE)
 
     def changes(self, other: Candidate) -> tuple[Change, ...]:
@@ -121,15 +121,15 @@ class ModelChoice:
         theirs = dict(zip(other.estimate.unknowns, other.estimate.values.tolist(), strict=True))
         columns = (e.unknowns, e.values.tolist(), e.between_runs().tolist(), e.scale.tolist())
         for unknown, value, deviation, size in zip(*columns, strict=True):
-            if unknown.name in e.asked.params and unknown in theirs:
+            if unknown.name in e.question.params and unknown in theirs:
                 change = (theirs[unknown] - value) / size if size > 0.0 else math.nan
                 sigmas = change / deviation if deviation > 0.0 else math.nan
                 found.append(Change(unknown.name, 100.0 * change, sigmas))
         return tuple(found)
 
     def interval(self, unknown: Unknown, level: float = 0.95) -> tuple[float, float]:
-        """Interval of the mixture of the models that are left over, SI units."""
-        parts = [(c.weight, *own) for c in self.left_over if (own := _normal(c.estimate, unknown)) is not None]
+        """Interval of the mixture of the plausible models [SI units]."""
+        parts = [(c.weight, *gaussian) for c in self.plausible if (gaussian := _normal(c.estimate, unknown))]
         return mixture_interval(parts, level)
 
 

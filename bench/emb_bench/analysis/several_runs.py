@@ -1,4 +1,4 @@
-"""Several runs of one brake: whether they measured one number."""
+"""Several runs of one brake: test of homogeneity, slope over a condition, control chart."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class Constancy:
 def constancy(values: Sequence[float], deviations: Sequence[float]) -> Constancy:
     """Compare measurements of one number with positive standard deviations.
 
-    If these are shares of the number, take the same number for all: with each one's own value, those that came out
-    small would count too much.
+    Relative deviations have to be multiplied by one common value: with each measurement's value, small ones would count
+    too much.
     """
     from scipy import special
 
@@ -67,19 +67,19 @@ def slope(values: Sequence[float], deviations: Sequence[float], conditions: Sequ
     A run without a positive, finite deviation does not count.
     """
     v, s, x = (np.asarray(given, np.float64) for given in (values, deviations, conditions))
-    known = np.isfinite(s) & (s > 0.0)
-    if np.count_nonzero(known) < 3:
+    usable = np.isfinite(s) & (s > 0.0)
+    if np.count_nonzero(usable) < 3:
         return None
     from scipy import special
 
-    v, x, weights = v[known], x[known], s[known] ** -2.0
+    v, x, weights = v[usable], x[usable], s[usable] ** -2.0
     away = x - weights @ x / weights.sum()
     spread = float(weights @ away**2)
     if not spread > 0.0:
         return None
     found, freedom = float((weights * away) @ v / spread), len(v) - 2
-    left = v - weights @ v / weights.sum() - found * away
-    scatter = math.sqrt(float(weights @ left**2) / freedom)  # about the line, over that of the stated deviations
+    residuals = v - weights @ v / weights.sum() - found * away
+    scatter = math.sqrt(float(weights @ residuals**2) / freedom)  # about the line, over the stated deviations
     deviation = spread**-0.5 * max(1.0, scatter)
     size = abs(found / deviation)
     p_value = 2.0 * special.stdtr(freedom, -size) if scatter > 1.0 else special.erfc(size / math.sqrt(2.0))
@@ -87,7 +87,7 @@ def slope(values: Sequence[float], deviations: Sequence[float], conditions: Sequ
 
 
 def beyond(values: Sequence[float], deviations: Sequence[float]) -> list[int]:
-    """Runs outside of a control chart's limits: beyond the median by ``BEYOND`` standard deviations of their own."""
+    """Runs outside of a control chart's limits: ``BEYOND`` standard deviations of the run from the median."""
     if len(values) < 3:
         return []
     distances = np.abs(np.asarray(values) - np.median(values))
@@ -95,14 +95,14 @@ def beyond(values: Sequence[float], deviations: Sequence[float]) -> list[int]:
 
 
 Effects = Mapping[str, tuple[float, float]]
-"""Biases by effects, and the sizes of these."""
+"""Biases by effects, and the sizes of the effects, by name."""
 
 
 def apart_by(deviation: float, effects: Effects, other: Effects) -> float:
-    """Part of a deviation between runs of one brake that another run, with biases by ``other`` effects, does not share.
+    """Part of a run's deviation that counts in its difference to another run of the brake with ``other`` biases.
 
-    An effect of the brake has one size in both runs: it moves them apart as far as the same size moves both otherwise.
-    What changes in a run is another one in each. The biases by ``effects`` are part of the ``deviation``.
+    An effect of the brake has the same size in both runs: only the difference of its two biases counts. A drift within
+    a run is independent in each. The biases by ``effects`` are part of the ``deviation``.
     """
     square = max(deviation**2 - sum(bias**2 for bias, _ in effects.values()), 0.0)
     for name, (bias, size) in effects.items():

@@ -15,7 +15,7 @@ from emb_bench.analysis.model_choice import choose_model
 from emb_bench.analysis.options import EstimateOptions
 from emb_bench.analysis.profile import profiles
 from emb_bench.analysis.records import ModelChoice
-from emb_bench.analysis.study import Checks, Run, Study
+from emb_bench.analysis.study import Checks, StudiedRun, Study
 from emb_bench.brake.parameters import least
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, EVERY, Plant
@@ -40,8 +40,7 @@ def make_study(
 ) -> Study:
     """Reads the experiments of logs, estimates from them together, checks the model and draws the conclusions.
 
-    For a report a log without an experiment is named instead of refused, and of several runs each is studied alone,
-    too.
+    A report also takes logs without an experiment, and studies each of several runs alone besides.
 
     Raises:
         UsageError: logs do not go together, one run is given twice, or they are too few for the options.
@@ -78,23 +77,23 @@ def side_by_side(bench: Bench, logs: Sequence[RunLog], options: EstimateOptions)
     return Study((replace(first, alone=before), replace(second, alone=after)), None, Checks(), (), options)
 
 
-def _read(bench: Bench, log: RunLog, name: str, options: EstimateOptions, for_report: bool) -> Run:
-    """A run with its experiment; for a report one without a part in the estimate where its log says too little."""
+def _read(bench: Bench, log: RunLog, name: str, options: EstimateOptions, for_report: bool) -> StudiedRun:
+    """A run with its experiment; for a report also a run that has too little data for an estimate."""
     if not for_report:
         check_sample_time(log, bench)
-        return Run(log, name, read_experiment(log, bench, name))
+        return StudiedRun(log, name, read_experiment(log, bench, name))
     try:
         experiment = read_experiment(log, bench, name)
     except LogError as err:
-        return Run(log, name, None, str(err).removeprefix(f"{log.path}: "))
+        return StudiedRun(log, name, None, str(err).removeprefix(f"{log.path}: "))
     check_sample_time(log, bench)
     plant = plant_of(bench, [log], options)
     samples = int(experiment.measured.sum())
-    return Run(log, name, experiment, too_few(plant, options.problem(bench, plant), samples, 1))
+    return StudiedRun(log, name, experiment, too_few(plant, options.problem(bench, plant), samples, 1))
 
 
-def _study(bench: Bench, runs: Sequence[Run], options: EstimateOptions, last: Earlier | None = None) -> Study:
-    """The study of runs, of which at least one has a part in the estimate."""
+def _study(bench: Bench, runs: Sequence[StudiedRun], options: EstimateOptions, last: Earlier | None = None) -> Study:
+    """The study of runs, at least one of which is used."""
     used = [run for run in runs if not run.why_not]
     method = options.method_on(bench)
     if options.model == EVERY and method != "oem":
@@ -105,8 +104,8 @@ def _study(bench: Bench, runs: Sequence[Run], options: EstimateOptions, last: Ea
         return [run.experiment.seen_by(plant) for run in used if run.experiment is not None]
 
     if options.model == EVERY:
-        plants, asked = [bench.model(name) for name in bench.plants], options.problem(bench, plant)
-        choice = choose_model(bench, plants, experiments_of, asked, starts=options.starts, seed=options.seed)
+        plants, question = [bench.model(name) for name in bench.plants], options.problem(bench, plant)
+        choice = choose_model(bench, plants, experiments_of, question, starts=options.starts, seed=options.seed)
         e = choice.best.estimate
     else:
         estimator = method_of(method)(
@@ -114,7 +113,7 @@ def _study(bench: Bench, runs: Sequence[Run], options: EstimateOptions, last: Ea
         )
         e = estimator.fit(experiments_of(plant))
     checks = Checks(
-        # The likelihood of a whole recording is none of windows.
+        # A profile's likelihood is that of one simulation, not of windows.
         profiles=profiles(e, of_all=options.profile) if method != "windows" else (),
         held_out=leave_one_out(e) if len(used) > 1 else (),
         drifts=() if last is None else drifts(e, last),
@@ -122,12 +121,12 @@ def _study(bench: Bench, runs: Sequence[Run], options: EstimateOptions, last: Ea
         apart=apart(e) if method == "oem" else (),
     )
     conclusions = conclude(e, checks.profiles, checks.drifts, predicts=checks.predicts)
-    conclusions = covering(conclusions, [e.unknowns[i] for i in e.wanted()], choice)
+    conclusions = covering(conclusions, [e.unknowns[i] for i in e.requested()], choice)
     return Study(tuple(runs), e, checks, conclusions, options, last)
 
 
 def plant_of(bench: Bench, logs: Sequence[RunLog], options: EstimateOptions) -> Plant:
-    """The plant that a study of logs begins with: the one that was asked for, or that of the logs."""
+    """The first plant of a study: the one of the options, or that of the logs."""
     if options.model is not None:
         return bench.model(DEFAULT_PLANT if options.model == EVERY else options.model)
     models = sorted({default_model(log)[0] for log in logs})
@@ -141,8 +140,8 @@ def plant_of(bench: Bench, logs: Sequence[RunLog], options: EstimateOptions) -> 
 def covering(
     conclusions: Sequence[Conclusion], unknowns: Sequence[Unknown], choice: ModelChoice | None
 ) -> tuple[Conclusion, ...]:
-    """Conclusions whose intervals cover all models that the experiments do not tell apart."""
-    if choice is None or len(choice.left_over) < 2:
+    """Conclusions with intervals that cover all plausible models."""
+    if choice is None or len(choice.plausible) < 2:
         return tuple(conclusions)
     return tuple(
         replace(c, interval=bounded(union(c.interval, choice.interval(unknown)), c.value, least(unknown.name)))
@@ -151,9 +150,9 @@ def covering(
 
 
 def _check_different(experiments: Sequence[Experiment]) -> None:
-    """Refuse a run that is given twice, whatever its files are called and however much of it each of them holds.
+    """Refuse a run that is given twice, also by files of other names or lengths: two runs never have the same noise.
 
-    Two runs never have the same noise; counted twice one would halve its variance, and predict itself.
+    Counted twice, a run would halve its variance and predict itself.
     """
     for i, experiment in enumerate(experiments):
         for other in experiments[:i]:

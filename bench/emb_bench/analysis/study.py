@@ -45,18 +45,18 @@ class Stop:
 
     @property
     def aborted(self) -> bool:
-        """Returns True if the experiment itself was cut short."""
+        """Returns True if the experiment was cut short."""
         return self.periods < self.planned
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class StudiedRun:
     """One run of a study."""
 
     log: RunLog
-    name: str  # Name to show: the file's, or its path where another one has that name
+    name: str  # Of the file, or its path if another run has that name
     experiment: Experiment | None  # None if the log has none
-    why_not: str = ""  # Reason that it has no part in the estimate; empty if it has
+    why_not: str = ""  # Reason that it is not in the estimate; empty if it is
     alone: Study | None = None  # Study of this run by itself, where a report has several
 
     @cached_property
@@ -89,11 +89,11 @@ class Checks:
     """Checks of a joint estimate."""
 
     profiles: tuple[Profile, ...] = ()
-    """Profiles of the unknowns that the experiments share: all, or those whose verdict may depend on one."""
+    """Profiles of the shared unknowns: all, or those that :func:`~emb_bench.analysis.profile.profiles` selects."""
     held_out: tuple[HeldOut, ...] = ()  # Prediction of each experiment from the others; empty for a single one
     drifts: tuple[Drift, ...] = ()
     choice: ModelChoice | None = None  # Models that were compared; None if one was given
-    apart: tuple[Differing, ...] = ()  # Parameters in which runs differ that each fit alone; empty if they fit together
+    apart: tuple[Differing, ...] = ()  # Parameters that differ between runs, each of which fits alone
 
     @property
     def predicts(self) -> bool:
@@ -105,8 +105,8 @@ class Checks:
 class Study:
     """Runs of one brake, their joint estimate, its checks and the conclusions."""
 
-    runs: tuple[Run, ...]
-    joint: Estimate | None  # Of the runs that have a part in it, in their order; None in a report where none has
+    runs: tuple[StudiedRun, ...]
+    joint: Estimate | None  # Of the used runs, in their order; None in a report without any
     checks: Checks
     conclusions: tuple[Conclusion, ...]
     options: EstimateOptions
@@ -158,9 +158,9 @@ class Study:
 
     @property
     def covariance(self) -> Floats:
-        """Covariance of the values by all that the total has, in their units, in the order of ``params``."""
-        e, wanted = self.estimate, self.estimate.wanted()
-        covariance: Floats = (e.covariance() * np.outer(e.scale, e.scale))[np.ix_(wanted, wanted)]
+        """Total covariance of the values, in their units, in the order of ``params``."""
+        e, index = self.estimate, self.estimate.requested()
+        covariance: Floats = (e.covariance() * np.outer(e.scale, e.scale))[np.ix_(index, index)]
         return covariance
 
     @property
@@ -176,8 +176,8 @@ class Study:
     @property
     def clamping(self) -> Clamping | None:
         """Clamping force, holding current and friction band; None of a wrong model, or where a parameter is missing."""
-        known = {name for name in NEEDED if name in self and self[name].identified}
-        return clamping(self.estimate) if known == {*NEEDED} and verdict(self).holds else None
+        is_complete = all(name in self and self[name].identified for name in NEEDED)
+        return clamping(self.estimate) if is_complete and verdict(self).holds else None
 
     @property
     def residuals(self) -> tuple[Floats, ...]:
@@ -233,12 +233,12 @@ class Study:
         return "; ".join(reasons) if self.joint is None else ""
 
     @property
-    def used(self) -> tuple[Run, ...]:
+    def used(self) -> tuple[StudiedRun, ...]:
         """The runs of the estimate, in the order of its experiments."""
         return tuple(run for run in self.runs if not run.why_not)
 
     @property
-    def reported(self) -> tuple[Run, ...]:
+    def reported(self) -> tuple[StudiedRun, ...]:
         """The runs of the estimate, or all where there is none."""
         return self.used or self.runs
 
@@ -254,7 +254,7 @@ class Study:
 
     @property
     def truth(self) -> BrakeParameters | None:
-        """Parameters of the simulated brake, if known and the same in all logs."""
+        """Parameters of the simulated brake, if all logs have the same."""
         truths = {log.truth for log in self.logs}
         return truths.pop() if len(truths) == 1 else None
 
@@ -276,9 +276,9 @@ class Study:
 
     @property
     def outside(self) -> list[tuple[str, Conclusion]]:
-        """Parameters outside of the ranges for which the shield guarantees the limits, behind the name of the run.
+        """Names of runs with the parameters outside of the ranges for which the shield guarantees the limits.
 
-        Of runs that are estimated alone, too, each one's.
+        Of the runs alone, if they are estimated alone.
         """
         found = [(run.name, c) for run in self.runs if run.alone is not None for c in run.alone.conclusions]
         found = found or [(self.names[0], c) for c in self.conclusions]
@@ -291,7 +291,7 @@ class Study:
 
     @property
     def minima(self) -> list[list[End]]:
-        """Local searches by the minimum where they ended, best first; none where chi2 is not that of the samples."""
+        """Local searches by the minimum where they ended, best first; none for least squares, which does not search."""
         groups: list[list[End]] = []
         for end in self.estimate.ends if self.estimate.method != "rls" else ():
             if groups and end.cost - groups[-1][0].cost <= SAME:
@@ -355,8 +355,8 @@ class Verdict(NamedTuple):
         return Code.FITS.value if self.holds else self.model.value
 
 
-Held = Callable[["Study", Result | None], bool]
-VERDICTS: tuple[tuple[Code, Tone, Held], ...] = (
+Condition = Callable[["Study", Result | None], bool]
+VERDICTS: tuple[tuple[Code, Tone, Condition], ...] = (
     (Code.ABORTED, "bad", lambda s, _: bool(s.used) and all(run.stop and run.stop.aborted for run in s.used)),
     (Code.STOPPED, "bad", lambda s, _: bool(s.stops)),
     (Code.REJECTED, "bad", lambda _, accepted: accepted is Result.FAIL),
@@ -364,8 +364,8 @@ VERDICTS: tuple[tuple[Code, Tone, Held], ...] = (
     (Code.ACCEPTED, "good", lambda _, accepted: accepted is Result.PASS),
     (Code.APART, "bad", lambda s, _: bool(s.checks.apart)),
 )
-"""Verdicts on a study as a whole, the most severe first, with their tones and conditions."""
-MODEL_VERDICTS: tuple[tuple[Code, Tone, Held], ...] = (
+"""Verdicts on the runs and on acceptance, the most severe first, with their tones and conditions."""
+MODEL_VERDICTS: tuple[tuple[Code, Tone, Condition], ...] = (
     (Code.NO_ESTIMATE, "care", lambda s, _: s.joint is None),
     (Code.BIASED_METHOD, "bad", lambda s, _: s.estimate.method == "rls" and not (s.model_fits and s.checks.predicts)),
     (Code.DOES_NOT_FIT, "bad", lambda s, _: not s.model_fits),
@@ -373,20 +373,20 @@ MODEL_VERDICTS: tuple[tuple[Code, Tone, Held], ...] = (
     (Code.NOT_IDENTIFIED, "care", lambda s, _: bool(s.unidentified)),
     (Code.FITS, "good", lambda *_: True),
 )
-"""Those on its model, which follow."""
+"""Verdicts on the model, the most severe first."""
 
 
 def verdict(study: Study, accepted: Result | None = None) -> Verdict:
     """The most severe verdict that holds; ``accepted`` is the result of acceptance criteria, if there are any.
 
-    A brake outside of the shield's ranges is never good, nor is a simulated one, or a log that lacks something. Of runs
-    side by side it is the worst one.
+    The tone is never good for a brake outside of the shield's ranges, a simulated brake or an incomplete log. The
+    verdict on runs side by side is the worst one.
     """
     if study.side_by_side:
-        found = [verdict(own, accepted) for own in study.side_by_side]
+        found = [verdict(one, accepted) for one in study.side_by_side]
         return min(found, key=lambda one: (list(Code).index(one.code), ("bad", "care", "good").index(one.tone)))
-    model, tone = next((code, tone) for code, tone, held in MODEL_VERDICTS if held(study, accepted))
-    code, tone = next(((code, tone) for code, tone, held in VERDICTS if held(study, accepted)), (model, tone))
+    model, tone = next((code, tone) for code, tone, holds in MODEL_VERDICTS if holds(study, accepted))
+    code, tone = next(((code, tone) for code, tone, holds in VERDICTS if holds(study, accepted)), (model, tone))
     if study.outside:
         tone = "bad"
     elif tone == "good" and any(run.log.simulated or not run.log.complete for run in study.reported):

@@ -135,7 +135,7 @@ def _beginning(experiment: Experiment) -> str | None:
 def _of_the_information(e: Evaluation) -> Row:
     physical = e.fisher("physical")
     own, bounds = physical.criteria(), physical.cramer_rao()
-    identified = {finding.name: finding.identified for finding in e.verdict().findings}
+    identified = {finding.name: finding.identified for finding in e.identifiability().findings}
     said = {e.log.missing, *lacks(e.experiment)}
     found: Row = {
         "warnings": tuple(escaped(warning) for warning in warnings(e) if warning not in said),
@@ -170,7 +170,7 @@ def _of_the_estimate(e: Estimate, truth: BrakeParameters | None) -> Row:
         "outside": tuple(said.label for said in conclusions if said.outside is not None),
     }
     deviations, between = e.deviations(), e.between_runs()
-    for i, said in zip(e.wanted(), conclusions, strict=True):
+    for i, said in zip(e.requested(), conclusions, strict=True):
         name = e.unknowns[i].name
         value, low, high, noise = said.value, *said.interval, said.repeatability
         true = _true(truth, name)

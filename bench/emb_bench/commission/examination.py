@@ -129,7 +129,7 @@ def identify(logs: Sequence[RunLog], sheet: Bench, noise: Noise, before: Identif
     velocity = velocity_of(experiments, sheet.timing.sample_time)
     bench = replace(sheet, noise=noise_in_motion(noise, logs[0].drive), sensors=velocity.sensors)
     best = _best(bench, experiments, before, velocity.bandwidth)
-    asked = with_systematic(best.asked, bench, best.plant)
+    asked = with_systematic(best.question, bench, best.plant)
     e = fit_from(Problem(bench, best.plant, asked, best.experiments), best).finished() if asked.systematic else best
     names = [unknown.name for unknown in e.unknowns]
     half = NORMAL_95 * e.between_runs() * e.scale
@@ -197,7 +197,7 @@ def _best(
     best = min(found, key=misfit)
     if best.validation.fits or len(experiments) == 1:  # a single one does not tell features apart
         return best
-    return grow_model(bench, best.plant, best.experiments, best.asked, starts=1, seed=0)
+    return grow_model(bench, best.plant, best.experiments, best.question, starts=1, seed=0)
 
 
 def _residuals(e: Estimate, noise: Noise) -> Noise:

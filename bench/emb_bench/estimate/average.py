@@ -1,15 +1,15 @@
-"""Average over whether each systematic error is there (docs/explanation/estimation.md).
+"""Bayesian average over the presence of each systematic error (docs/explanation/estimation.md).
 
-A bench has no certain error with the probability ``ABSENT``; else the error is Gaussian, of a deviation that is one of
-``SHARES`` of its prior's: a spike and a slab (Mitchell and Beauchamp, Journal of the American Statistical Association
-83, 1988). For given deviations the estimate is Gaussian in the linearised problem, and all of them count with their
+An error is absent with the probability ``ABSENT``; otherwise it is Gaussian, with one of ``SHARES`` of its prior's
+standard deviation: a spike and a slab (Mitchell and Beauchamp, Journal of the American Statistical Association 83,
+1988). For given deviations the estimate of the linearised problem is Gaussian; the combinations are averaged with their
 probabilities given the experiment (Bayesian model averaging: Hoeting, Madigan, Raftery and Volinsky, Statistical
 Science 14, 1999).
 
 Let M be the information with all priors in full, C its inverse, and S the prior deviations of the errors η. The samples
 have the information A = C_ηη⁻¹ − S⁻² on η, and the score b = C_ηη⁻¹ η̂. With the deviations D, the errors have the
-covariance V = D (1 + D A D)⁻¹ D and the mean V b, and D counts as before times |1 + D A D|^−½ exp(½ bᵀ V b). All other
-unknowns follow the errors by regression.
+covariance V = D (1 + D A D)⁻¹ D and the mean V b, and the posterior weight of D is its prior probability times
+|1 + D A D|^−½ exp(½ bᵀ V b). The other unknowns follow from the errors by regression.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from emb_bench.brake.motion import Floats
 from emb_bench.estimate.prediction import Problem
 from emb_bench.information.identifiability import Spectrum, schur_complement
 
-ABSENT = 5.0 / 6.0  # Probability, before any experiment, that a bench does not have a certain systematic error
-SHARES = (1e-3, 1e-2, 0.1, 1.0)  # Deviations of an error that is there, over that of its prior
+ABSENT = 5.0 / 6.0  # Prior probability that a bench does not have a given systematic error
+SHARES = (1e-3, 1e-2, 0.1, 1.0)  # Deviations of a present error, over that of its prior
 
 
 class Average(NamedTuple):
-    """A linearised problem as it is averaged over combinations of errors, each with deviations of its own."""
+    """A linearised problem averaged over combinations of errors and of their deviations."""
 
     step: Floats  # From the point of linearisation to the mean of the unknowns, shape (p,)
     errors: list[int]  # Places of the systematic errors among the unknowns
@@ -47,17 +47,17 @@ class Average(NamedTuple):
         return found
 
     def biases(self, effects: Sequence[Influence]) -> tuple[Floats, Floats]:
-        """Root mean squares of effects' biases of the unknowns, with the signs of positive ones', and of their sizes.
+        """Root mean squares of the biases by effects, signed as for positive ones, and of the effects' sizes.
 
         Shapes (effects, p) and (effects,).
         """
         moved, information, score, deviations, present, besides = map(np.array, zip(*effects, strict=True))
         there, sizes = moved[:, self.errors], deviations[:, None, :]
-        own = there @ self.full
-        spread = np.einsum("cij,ej->eci", self.covariances, own)
-        seen = np.einsum("ei,ei->e", own, there)[:, None] - np.einsum("ei,eci->ec", own, spread)
+        score_gain = there @ self.full
+        spread = np.einsum("cij,ej->eci", self.covariances, score_gain)
+        seen = np.einsum("ei,ei->e", score_gain, there)[:, None] - np.einsum("ei,eci->ec", score_gain, spread)
         informations = (information[:, None] + np.maximum(seen, 0.0))[:, :, None]
-        scores = (score[:, None] + own @ self.shifts.T)[:, :, None]
+        scores = (score[:, None] + score_gain @ self.shifts.T)[:, :, None]
         changed = moved[:, None] - (there[:, None] - spread) @ self.gain.T
         changed += np.copysign(besides[:, None], changed)
         variances = 1.0 / (sizes**-2.0 + informations)
@@ -73,14 +73,14 @@ class Average(NamedTuple):
 
 
 class Influence(NamedTuple):
-    """An effect that is not estimated, beside the fit with all priors in full."""
+    """An unmodelled effect, relative to the fit with all priors in full."""
 
     moved: Floats  # Change of the unknowns by an effect of size 1, shape (p,)
     information: float  # On its size
     score: float  # Of the residuals
-    deviations: Floats  # Those that its prior may have, as many as of any other effect
-    present: float  # Probability before the experiment that it is there
-    besides: Floats  # Further bias of each unknown, which adds to its size
+    deviations: Floats  # Possible deviations of its prior, equally many for each effect
+    present: float  # Prior probability that it is present
+    besides: Floats  # Further bias of each unknown, added in absolute value
 
 
 def average(problem: Problem, z: Floats, found: tuple[Floats, Floats]) -> Average:
@@ -89,7 +89,7 @@ def average(problem: Problem, z: Floats, found: tuple[Floats, Floats]) -> Averag
     unit = np.linalg.norm(jacobian, axis=0)
     unit = np.where(unit > 0.0, unit, 1.0)
     step = -np.linalg.lstsq(jacobian / unit, residuals, rcond=None)[0] / unit if residuals.any() else np.zeros(len(z))
-    names, priors = [unknown.name for unknown in problem.unknowns], problem.asked.systematic
+    names, priors = [unknown.name for unknown in problem.unknowns], problem.question.systematic
     at = [i for i, name in enumerate(names) if name in priors]
     if not at:
         return unaveraged(step)
@@ -116,17 +116,17 @@ def unaveraged(step: Floats) -> Average:
 
 
 def _combinations(full: Floats, score: Floats, priors: Floats, groups: Sequence[int]) -> tuple[Floats, Floats, Floats]:
-    """Logarithms of the probabilities of all combinations, and means and covariances of the errors by each.
+    """Logarithms of the probabilities of all combinations, with the means and covariances of the errors.
 
-    Errors of one group are there together, at one share of their priors.
+    Errors of one group are present together, with the same share of their priors.
     """
     data = full - np.diag(priors**-2.0)
     before = np.log([ABSENT, *[(1.0 - ABSENT) / len(SHARES)] * len(SHARES)])
-    chosen = np.array(list(itertools.product(range(len(before)), repeat=max(groups) + 1)))
-    d = np.array([0.0, *SHARES])[chosen][:, groups] * priors
+    combinations = np.array(list(itertools.product(range(len(before)), repeat=max(groups) + 1)))
+    d = np.array([0.0, *SHARES])[combinations][:, groups] * priors
     inner = d[:, :, None] * data * d[:, None, :] + np.eye(len(priors))
     covariances = d[:, :, None] * np.linalg.inv(inner) * d[:, None, :]
     means = covariances @ score
-    logs = before[chosen].sum(axis=1) - 0.5 * np.linalg.slogdet(inner)[1] + 0.5 * means @ score
+    logs = before[combinations].sum(axis=1) - 0.5 * np.linalg.slogdet(inner)[1] + 0.5 * means @ score
     logs -= logs.max()
     return logs - np.log(np.exp(logs).sum()), means, covariances

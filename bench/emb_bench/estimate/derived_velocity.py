@@ -1,9 +1,10 @@
-"""Test of whether a velocity is a measurement of its own, or an observer derives it from the angle.
+"""Test of whether the velocity is measured, or an observer derives it from the angle.
 
-The mean velocity over a period is the difference of its two angles, whatever moves the brake. Measured velocities have
-that mean; those that lag fall short of it by the lag times the acceleration. An observer lags by 0.36 periods at least
-(:mod:`emb_bench.sim.instruments`); a jittering clock, a wrong scale and late frames make no lag. The bandwidth is that
-of the observer that makes the velocity of the measured angles best, sampled with them or more often.
+The mean velocity over a period is the difference of its two angles over the period. A lagging velocity differs from
+this mean by the lag times the acceleration. An observer lags by 0.36 periods at least
+(:mod:`emb_bench.sim.instruments`); jitter of the clock, a wrong scale and late frames cause no lag. The bandwidth is
+fitted: that of the observer whose output for the measured angles is nearest to the velocity, at the sample rate or a
+multiple of it.
 """
 
 from __future__ import annotations
@@ -19,18 +20,18 @@ from emb_bench.estimate.records import Derived
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.estimator.observer import observer_gains
 
-SURE = 10.0  # Standard deviations by which the lag differs from zero
+SURE = 10.0  # Significance of the lag [standard deviations]
 LEAST = 0.1  # Lag [samples]: no observer has less
 DAMPINGS = (0.7, 0.85, 1.0)
-PARTS = (1, 2, 8)  # Of a period, after each of which the observer takes an angle
+PARTS = (1, 2, 8)  # Observer steps in a period
 SCALED = np.geomspace(0.03, 6.0, 60)  # Bandwidth times sample time
 BOUNDS = [(0.02, 10.0), (0.7, 1.0)]  # Of what is searched
-STARTS = 3  # Of the nearest, from which a nearer one is searched
-ALIKE = 1.25  # Ratio of mean squares of two observers that are not told apart
-TOLD = 1.3  # Ratio of the ends of a bandwidth that is known
-SETTLED = 20  # Samples after the begin or a gap, during which an observer forgets what is not known
-FEWEST = 10  # Periods of an experiment that tell a lag
-LONGEST = 20_000  # Samples of an experiment that are looked at
+STARTS = 3  # Local searches, from the best points of the grid
+ALIKE = 1.25  # Ratio of mean squares below which two observers fit alike
+TOLD = 1.3  # Largest ratio of the bandwidths that fit, for a determined one
+SETTLED = 20  # Samples after the begin or a gap until the initial state of an observer has decayed
+FEWEST = 10  # Fewest periods of an experiment
+LONGEST = 20_000  # Most samples of an experiment
 
 
 def derived(experiments: Sequence[Experiment], t_s: float) -> Derived | None:
@@ -44,13 +45,13 @@ def derived(experiments: Sequence[Experiment], t_s: float) -> Derived | None:
 
 
 def _lag(angle: Floats, velocity: Floats, t_s: float) -> tuple[float, float]:
-    """Lag of the velocity behind the angle, beside an error of its scale, and its standard deviation [s]."""
+    """Lag of the velocity behind the angle, with the scale as a nuisance, and its standard deviation [s]."""
     mean, acceleration = 0.5 * (velocity[1:] + velocity[:-1]), np.diff(velocity) / t_s
     short = np.diff(angle) / t_s - mean
-    known = np.isfinite(short)
-    if known.sum() < FEWEST:
+    received = np.isfinite(short)
+    if received.sum() < FEWEST:
         return 0.0, 0.0
-    rows, short = np.stack([acceleration, mean], axis=1)[known], short[known]
+    rows, short = np.stack([acceleration, mean], axis=1)[received], short[received]
     inverse = np.linalg.pinv(rows)
     fitted = inverse @ short
     spread = inverse[0] @ (inverse[0] * (short - rows @ fitted) ** 2)  # errors of fast samples are larger: White 1980
@@ -58,7 +59,7 @@ def _lag(angle: Floats, velocity: Floats, t_s: float) -> tuple[float, float]:
 
 
 def _bandwidth(angle: Floats, velocity: Floats, t_s: float) -> tuple[float, float, bool]:
-    """Best bandwidth, the least that is not told apart from it [rad/s], and whether the others are near."""
+    """Best bandwidth, the least that fits alike [rad/s], and True if all that fit alike are near."""
     from scipy.signal import lfilter  # slow to import, and for a velocity that lags only
 
     at, received = np.arange(len(angle)), np.isfinite(angle) & np.isfinite(velocity)

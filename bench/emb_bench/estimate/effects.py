@@ -1,11 +1,11 @@
-"""Effects that a model lacks or holds fixed: a row for each, with what one unit of it adds to the samples.
+"""Effects that a model lacks or holds fixed: a row for each, with the change of the samples per unit of it.
 
 Score tests (:mod:`emb_bench.estimate.suspects`), the uncertainty budget, the average over effects that may be there
 (:mod:`emb_bench.estimate.average`) and the expected interval (:mod:`emb_bench.estimate.expected`) come from these rows.
 A new effect is a row in :data:`EFFECTS`, and a field of ``[systematic]`` of the bench file for its prior.
 
-What an effect adds is the sensitivity where the plant has one; a secant from its null value where it has a threshold
-there; and the sensitivity to a torque that counts in each period by a share, where the brake has none.
+The regressor of an effect is the plant's sensitivity, if it has one; a secant from the null value, if the effect has a
+threshold there; or the sensitivity to a parameter's torque with a weight in each period, if the plant lacks the effect.
 """
 
 from __future__ import annotations
@@ -42,46 +42,46 @@ from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Limits
 
 SLOW = 30.0  # Stribeck velocity with which friction at rest is suspected, where the plant has none [rad/s]
 SMALLEST = 1e-12  # Share of a period that counts, per unit of an effect; a sensitivity is divided by it
-SMALL = 1e-6  # Size of a change of what is shown, of which there is a difference
+SMALL = 1e-6  # Step of the finite differences of samples [rad, rad/s]
 
 DRIFTS = tuple(f"{name}_drift" for name in PARAMETER_NAMES)
 """Linear changes of the parameters, as shares of them from the begin of a run to its end."""
 ANGLE_SCALE, CURRENT_SCALE, TIME_SCALE = SCALES = "angle_scale", "current_scale", "time_scale"
 """Relative errors of the scales of angle and current, and of the clock."""
-LAGGING = "velocity_lag"  # Explains a misfit if the velocity itself shows an observer
+LAGGING = "velocity_lag"  # Explains a misfit if an observer is found in the velocity
 
 
 # ---- the model at an estimate ----
 
 
-class Shown(Protocol):
-    """Samples of each experiment as a model expects them at an estimate, in standard deviations of its residuals."""
+class Prediction(Protocol):
+    """Predicted samples of each experiment at an estimate, in standard deviations of the residuals."""
 
     def columns(self, experiment: int, names: tuple[str, ...]) -> Floats:
-        """Derivatives of what is shown to other unknowns, shape (n, names, 2)."""
+        """Derivatives to further unknowns, shape (n, names, 2)."""
 
     def parts(self, experiment: int, unknowns: Integers, shares: Floats) -> Floats:
-        """Derivatives to unknowns that count in each period by shares of the shape (n, m), shape (n, m, 2)."""
+        """Derivatives to unknowns with a weight in each period, ``shares`` of shape (n, m), shape (n, m, 2)."""
 
-    def shown(self, experiment: int, mechanics: Mechanics) -> Floats:
-        """Samples of another brake under the same currents, shape (n, 2)."""
+    def whitened_samples(self, experiment: int, mechanics: Mechanics) -> Floats:
+        """Samples of a brake with other ``mechanics`` under the same currents, shape (n, 2)."""
 
     def whitened(self, experiment: int, shift: Floats) -> Floats:
-        """A small change of what is shown [rad, rad/s], in the unit of the residuals, shape (n, 2)."""
+        """A small change of the samples [rad, rad/s], in the unit of the residuals, shape (n, 2)."""
 
     def motion(self, experiment: int) -> Floats:
-        """Angle [rad] and velocity [rad/s] that are shown, shape (n, 2)."""
+        """Predicted angle [rad] and velocity [rad/s], shape (n, 2)."""
 
 
 @dataclass(frozen=True, eq=False)
-class Simulated:
-    """The simulation of output error."""
+class Simulation:
+    """Prediction of output error."""
 
     problem: Problem
     z: Floats
     weights: Sequence[Floats]
-    said: Sequence[Trajectory] | None = None  # Prediction of each experiment, where there is one,
-    besides: tuple[str, ...] = ()  # and the unknowns whose sensitivities are in it besides those of the problem
+    trajectories: Sequence[Trajectory] | None = None  # Trajectory of each experiment, if they have been computed,
+    besides: tuple[str, ...] = ()  # and their sensitivities besides those of the problem
 
     @cached_property
     def _mechanics(self) -> Mechanics:
@@ -89,37 +89,37 @@ class Simulated:
 
     @cached_property
     def _motion(self) -> list[Floats]:
-        said = self.said or [self.problem.motion(self.z, i) for i in range(len(self.problem.experiments))]
-        return [one.samples for one in said]
+        found = self.trajectories or [self.problem.motion(self.z, i) for i in range(len(self.problem.experiments))]
+        return [one.samples for one in found]
 
     def columns(self, experiment: int, names: tuple[str, ...]) -> Floats:
-        """As :class:`Shown`."""
-        own = len(self.problem.columns(experiment))
-        is_said = self.said is not None and names == self.besides
-        at = self.said[experiment] if self.said and is_said else self.problem.predict(self.z, experiment, names)
-        return at.sensitivities[:, own : own + len(names)] * self.weights[experiment][:, None]
+        """As :class:`Prediction`."""
+        first, computed = len(self.problem.columns(experiment)), self.trajectories
+        is_computed = computed is not None and names == self.besides
+        at = computed[experiment] if computed and is_computed else self.problem.predict(self.z, experiment, names)
+        return at.sensitivities[:, first : first + len(names)] * self.weights[experiment][:, None]
 
     def parts(self, experiment: int, unknowns: Integers, shares: Floats) -> Floats:
-        """As :class:`Shown`."""
+        """As :class:`Prediction`."""
         return self.problem.parts(self.z, experiment, unknowns, shares) * self.weights[experiment][:, None]
 
-    def shown(self, experiment: int, mechanics: Mechanics) -> Floats:
-        """As :class:`Shown`."""
+    def whitened_samples(self, experiment: int, mechanics: Mechanics) -> Floats:
+        """As :class:`Prediction`."""
         nominal = mechanics == self._mechanics
         samples = self._motion[experiment] if nominal else self.problem.motion(self.z, experiment, mechanics).samples
         return samples * self.weights[experiment]
 
     def whitened(self, experiment: int, shift: Floats) -> Floats:
-        """As :class:`Shown`."""
+        """As :class:`Prediction`."""
         return shift * self.weights[experiment]
 
     def motion(self, experiment: int) -> Floats:
-        """As :class:`Shown`."""
+        """As :class:`Prediction`."""
         return self._motion[experiment]
 
 
 class Path(NamedTuple):
-    """An experiment as the model moves."""
+    """Motion of the model in an experiment."""
 
     brake: BrakeParameters
     limits: Limits
@@ -129,13 +129,18 @@ class Path(NamedTuple):
     velocities: Floats  # At the same, shape (n + 1,) [rad/s]
 
 
-def columns(problem: Problem, z: Floats, shown: Shown, jacobian: Floats, names: tuple[str, ...]) -> dict[str, Floats]:
-    """Column of each effect, of some, that the model lacks: samples per unit in standard deviations, by name.
+def columns(
+    problem: Problem, z: Floats, prediction: Prediction, jacobian: Floats, names: tuple[str, ...]
+) -> dict[str, Floats]:
+    """Regressor of each effect that the model lacks, of those named: whitened samples per unit of the effect, by name.
 
     As long as all residuals, whose derivatives to z are the ``jacobian``.
     """
     ends = np.cumsum([0, *(experiment.samples.size for experiment in problem.experiments)]).tolist()
-    at = [Linearised(problem, z, shown, i, jacobian[begin:end], names) for i, (begin, end) in enumerate(pairwise(ends))]
+    at = [
+        Linearised(problem, z, prediction, i, jacobian[begin:end], names)
+        for i, (begin, end) in enumerate(pairwise(ends))
+    ]
     found = dict[str, Floats]()
     for name in names:
         row = EFFECTS[name]
@@ -155,48 +160,53 @@ def columns(problem: Problem, z: Floats, shown: Shown, jacobian: Floats, names: 
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """A model at an estimate along an experiment; its regressors are of samples, shape (n, 2), in standard deviations.
+    """Model linearised at an estimate, along one experiment; its regressors are whitened samples, shape (n, 2).
 
-    None of an effect that the model has, or that its brake cannot have.
+    A regressor is None if the model has the effect, or its brake cannot have it.
     """
 
     problem: Problem
     z: Floats
-    shown: Shown
+    prediction: Prediction
     experiment: int
     jacobian: Floats  # Derivatives of the residuals of its samples to z, shape (2 n, p)
-    names: tuple[str, ...]  # Effects that are asked for
+    names: tuple[str, ...]  # Requested effects
 
     def sensitivity(self, name: str) -> Floats | None:
         """The sensitivity to an unknown of the brake or of its instruments."""
         return None if name in _estimated(self.problem) else self._sensitivities.get(name)
 
     def secant(self, name: str) -> Floats | None:
-        """The secant from a feature's own value to a little more."""
+        """The secant from a feature's value to a little more."""
         step, before = PARAMETERS[name].step, self.mechanics
         after = None if name in _estimated(self.problem) else _with(before, name, step)
         if after is None:
             return self._turned.get(name)
         slow = after.stribeck_velocity
         if slow not in self._slowed:
-            self._slowed[slow] = self.shown.shown(self.experiment, before._replace(stribeck_velocity=slow))
-        return (self.shown.shown(self.experiment, after) - self._slowed[slow]) / step
+            self._slowed[slow] = self.prediction.whitened_samples(
+                self.experiment, before._replace(stribeck_velocity=slow)
+            )
+        return (self.prediction.whitened_samples(self.experiment, after) - self._slowed[slow]) / step
 
     def turned(self, name: str) -> Floats | None:
-        """The sensitivity to a torque that counts in each period by a share."""
+        """The sensitivity to a parameter's torque with a weight in each period."""
         return self._turned[name]
 
     def lag(self, _: str) -> Floats | None:
-        """A lag of the velocity, where it is no observer's anyway."""
+        """A lag of the velocity; None if the plant has an observer."""
         if self._is_observed:
             return None
-        before, velocity = self.problem.experiments[self.experiment].velocity, self.shown.motion(self.experiment)[:, 1]
+        before, velocity = (
+            self.problem.experiments[self.experiment].velocity,
+            self.prediction.motion(self.experiment)[:, 1],
+        )
         slope = np.diff(velocity, prepend=before) / self.problem.bench.timing.sample_time
         return self._small(np.stack([np.zeros_like(slope), -slope], axis=1))
 
     def angle_scale(self, _: str) -> Floats:
         """A larger angle; a velocity by an observer follows it."""
-        return self._small((self.shown.motion(self.experiment) - [self.offset, 0.0]) * [1.0, self._is_observed])
+        return self._small((self.prediction.motion(self.experiment) - [self.offset, 0.0]) * [1.0, self._is_observed])
 
     def current_scale(self, _: str) -> Floats:
         """A larger current, which acts as a larger k_m does."""
@@ -207,8 +217,8 @@ class Linearised:
         return 2.0 * self._sensitivities["J"] + self._sensitivities["f_v"]
 
     def _small(self, shift: Floats) -> Floats:
-        """A change of what is shown [rad, rad/s], to first order."""
-        return self.shown.whitened(self.experiment, SMALL * shift) / SMALL
+        """A change of the samples [rad, rad/s], whitened, to first order."""
+        return self.prediction.whitened(self.experiment, SMALL * shift) / SMALL
 
     @property
     def _is_observed(self) -> bool:
@@ -226,18 +236,18 @@ class Linearised:
 
     @cached_property
     def _slowed(self) -> dict[float, Floats]:
-        """Samples that are shown with a Stribeck velocity and no more static friction, by that velocity."""
-        return {self.mechanics.stribeck_velocity: self.shown.shown(self.experiment, self.mechanics)}
+        """Samples with a Stribeck velocity and unchanged static friction, by that velocity."""
+        return {self.mechanics.stribeck_velocity: self.prediction.whitened_samples(self.experiment, self.mechanics)}
 
     @cached_property
     def _sensitivities(self) -> dict[str, Floats]:
-        """Sensitivities to what is held, and those to k_m, f_v and J even if they are estimated."""
-        names, own = lacked_sensitivities(self.problem, self.names), [u.name for u in self.problem.unknowns]
+        """Sensitivities to fixed parameters, and to k_m, f_v and J even if they are estimated."""
+        names, unknowns = lacked_sensitivities(self.problem, self.names), [u.name for u in self.problem.unknowns]
         found: dict[str, Floats] = {
-            n: -self.jacobian[:, own.index(n)].reshape(-1, 2) for n in ("k_m", "f_v", "J") if n in own
+            n: -self.jacobian[:, unknowns.index(n)].reshape(-1, 2) for n in ("k_m", "f_v", "J") if n in unknowns
         }
         if names:
-            found |= zip(names, self.shown.columns(self.experiment, names).transpose(1, 0, 2), strict=True)
+            found |= zip(names, self.prediction.columns(self.experiment, names).transpose(1, 0, 2), strict=True)
         return found
 
     @cached_property
@@ -246,11 +256,11 @@ class Linearised:
         if not shares:
             return {}
         unknowns, counted = zip(*shares.values(), strict=True)
-        moved = self.shown.parts(self.experiment, np.array(unknowns), np.stack(counted, axis=1))
+        moved = self.prediction.parts(self.experiment, np.array(unknowns), np.stack(counted, axis=1))
         return dict(zip(shares, moved.transpose(1, 0, 2), strict=True))
 
     def shares(self) -> dict[str, tuple[int, Floats]]:
-        """Unknowns that turn the motor as effects do, and their shares in each period, by name."""
+        """Parameter whose torque acts as an effect does, and its weight in each period, by name."""
         path, m, found = self._path(), self.mechanics, dict[str, tuple[int, Floats]]()
         for name in self.names:
             torque = EFFECTS[name].torque
@@ -260,10 +270,10 @@ class Linearised:
         return found
 
     def _path(self) -> Path:
-        """The motion that is shown."""
-        at, shown = self.problem.at(self.z, self.experiment), self.shown.motion(self.experiment)
-        n, delay = len(shown), self.problem.plant.instruments.measurement_delay
-        ends = np.concatenate([shown[delay:], np.repeat(shown[-1:], min(delay, n), axis=0)])[:n]
+        """The predicted motion."""
+        at, motion = self.problem.at(self.z, self.experiment), self.prediction.motion(self.experiment)
+        n, delay = len(motion), self.problem.plant.instruments.measurement_delay
+        ends = np.concatenate([motion[delay:], np.repeat(motion[-1:], min(delay, n), axis=0)])[:n]
         return Path(
             at.brake,
             self.problem.bench.limits,
@@ -279,7 +289,7 @@ def _estimated(problem: Problem) -> set[str]:
 
 
 def lacked_sensitivities(problem: Problem, names: Iterable[str]) -> tuple[str, ...]:
-    """Those of some effects that have a sensitivity, and of k_m, f_v and J, that a model can have and holds fixed."""
+    """Fixed parameters of the model with a sensitivity: k_m, f_v and J, and the named effects."""
     plant, lacked = problem.plant, {"k_m", "f_v", "J", *names} - _estimated(problem)
     if not has_time_for_a_delay(plant):
         lacked -= {"delay"}
@@ -291,7 +301,7 @@ def lacked_sensitivities(problem: Problem, names: Iterable[str]) -> tuple[str, .
 
 
 def _with(m: Mechanics, name: str, step: float) -> Mechanics | None:
-    """The mechanics with a small effect more; None for those that cannot have it, or have no play yet."""
+    """The mechanics with a small amount of an effect added; None if they cannot have it, or have no play yet."""
     if m.solver != EXACT or (name == "play" and m.play == 0.0) or (name == "hysteresis" and m.play > 0.0):
         return None
     changed = m._replace(**{name: getattr(m, name) + step})
@@ -310,29 +320,26 @@ class Effect(NamedTuple):
     remedy: str
     regressor: Callable[[Linearised, str], Floats | None]  # Of one unit
     unit: str = ""
-    prior: str = ""  # Key of ``[systematic]``: standard deviation without any experiment; empty where none is allowed
-    positive: bool = False  # It is suspected on one side only
+    prior: str = ""  # Key of ``[systematic]`` with the prior deviation; empty without a prior
+    positive: bool = False  # Only positive amounts are tested
     torque: tuple[int, Callable[[Path], Floats]] | None = None
-    """Unknown, and its share in each period per unit of the effect."""
+    """Parameter, and the weight of its torque in each period per unit of the effect."""
     alone: bool = False
-    """No part of the test of all together, which noise with a slow colour would fail by it."""
-    tested: bool = True  # The residuals can tell it
-    is_certain: bool = False  # Constants that are wrong by something in every brake
+    """Not part of the joint test, which low-frequency noise would fail because of it."""
+    tested: bool = True  # There is a score test of it
+    is_certain: bool = False  # A constant with some error in every brake
     of_the_spring: bool = False  # A machine without a spring cannot have it
 
 
 def _mean(of: Callable[[Floats], Floats], ends: Floats) -> Floats:
-    """Means in the periods between these ends, in which a number changes evenly (Simpson)."""
+    """Means over periods of a function of a number that changes linearly between these ends (Simpson)."""
     first, last = ends[:-1], ends[1:]
     mean: Floats = (of(first) + 4.0 * of(0.5 * (first + last)) + of(last)) / 6.0
     return mean
 
 
 def _clearance(at: Path) -> Floats:
-    """Torque by which the clamp acts less on the motor behind a clearance, per size of it, as a current [A/rad].
-
-    Nut and force lag behind the screw.
-    """
+    """Decrease of the clamping torque by a clearance, per size of it, as a current [A/rad]: the nut lags the screw."""
     play, behind = PARAMETERS["play"].step, np.empty(len(at.angles))
     compiled(_behind)(at.angles, play, behind)
     result: Floats = at.brake.gamma * at.brake.k_1 / at.brake.k_m * 0.5 * (behind[1:] + behind[:-1]) / play
@@ -340,7 +347,7 @@ def _clearance(at: Path) -> Floats:
 
 
 def _behind(angles: Floats, play: float, behind: Floats) -> None:
-    """Fills in by how much less the nut is in contact than the screw [rad]."""
+    """Fills ``behind`` with the angle of contact that the nut lags the screw [rad]."""
     nut = angles[0]
     for k in range(len(angles)):
         nut = min(max(nut, angles[k] - 0.5 * play), angles[k] + 0.5 * play)
@@ -356,12 +363,12 @@ def _ripple(wave: Callable[[Floats], Floats]) -> Callable[[Path], Floats]:
 
 
 def _turning(effect: str, remedy: str, prior: str, unknown: int, share: Callable[[Path], Floats]) -> Effect:
-    """An effect that turns the motor by a share of a parameter's torque, or as a current [A]."""
+    """An effect that acts as a weighted torque of a parameter, or as a current [A]."""
     return Effect(effect, remedy, Linearised.turned, prior=prior, torque=(unknown, share), alone=True)
 
 
 def _drift(name: str, unknown: int, remedy: str) -> Effect:
-    """A drift by the whole parameter from the first period to the last, zero in the middle."""
+    """A linear drift by 100 % of the parameter over the run, zero in the middle."""
     row = _turning(f"a change of {name} over the run", remedy, "drift", unknown, lambda at: at.passed)
     return row._replace(alone=name != "k_m", of_the_spring=name == "k_1")
 
@@ -375,7 +382,7 @@ _TURN = "a torque that changes over a turn", _WALKS, "ripple", COMMAND
 _STIFF = "a stiffness that changes over a turn", _WALKS, "stiffness_ripple", K_1
 _SLOWLY = "a friction that decays over about {} rad/s"
 _PRIORS = {"J": "inertia", "contact": "", "x1_0": "", "x2_0": "", DIRECTED: ""} | dict.fromkeys(PARAMETER_NAMES, "held")
-"""Keys of priors that are not the name of the parameter, or that it has none."""
+"""Keys of priors that differ from the name of the parameter; empty without a prior."""
 _SPRING = ("k_1", "contact", "play", "f_l", "quadratic", "cubic", "hysteresis")
 
 EFFECTS: Mapping[str, Effect] = {
@@ -426,10 +433,10 @@ EFFECTS: Mapping[str, Effect] = {
 
 
 def possible(name: str, bench: Bench) -> tuple[float, float]:
-    """Least and greatest amount of an effect that a brake can have.
+    """Least and greatest physically possible amount of an effect.
 
-    No constant changes its sign or by more than is searched, nor is any other torque larger than what it changes.
-    Whole samples of a delay are not searched, yet possible.
+    A constant keeps its sign and its search range; an added torque is no larger than the torque that it changes. A
+    delay may exceed its search range, which ends at one sample.
     """
     if name == LAGGING:
         return 0.0, 0.1
@@ -445,7 +452,7 @@ def possible(name: str, bench: Bench) -> tuple[float, float]:
 
 
 def shown_as(s: Suspect | Contribution, machine: Machine | None) -> Quantity:
-    """Name and unit of an effect as they are shown; no unit for what is relative."""
+    """Name and unit of an effect for output; no unit if it is relative."""
     if s.name in SCALES:
         return Quantity(s.name.replace("_", " "), "")
     if s.name in DRIFTS:
@@ -457,23 +464,23 @@ def shown_as(s: Suspect | Contribution, machine: Machine | None) -> Quantity:
     return found._replace(unit="") if is_share else found
 
 
-def with_systematic(asked: EstimationProblem, bench: Bench, plant: Plant) -> EstimationProblem:
-    """The problem with what the bench cannot exclude and the plant can have: estimated too, or allowed for."""
+def with_systematic(question: EstimationProblem, bench: Bench, plant: Plant) -> EstimationProblem:
+    """The problem with the bench's systematic errors that the plant can have, estimated or as unmodelled effects."""
     priors = bench.systematic
-    if priors.k_m is not None and "k_m" in asked.names and not asked.known:
+    if priors.k_m is not None and "k_m" in question.names and not question.known:
         k_m = bench.brake.k_m
-        asked = freed(replace(asked, known={"k_m": (k_m, priors.k_m * k_m)}), bench)
-    timed = has_time_for_a_delay(plant) and "current_lag" not in asked.names
-    observed = plant.instruments.observer_bandwidth > 0.0  # its velocity is no measurement of its own
-    excluded = {*asked.names, *(() if timed else ("delay",)), *(("velocity_gain",) if observed else ())}
+        question = freed(replace(question, known={"k_m": (k_m, priors.k_m * k_m)}), bench)
+    timed = has_time_for_a_delay(plant) and "current_lag" not in question.names
+    observed = plant.instruments.observer_bandwidth > 0.0  # its velocity is derived from the angle
+    excluded = {*question.names, *(() if timed else ("delay",)), *(("velocity_gain",) if observed else ())}
     estimated = {name: float(getattr(priors, name)) for name in SYSTEMATIC if name not in excluded}
-    allowed = {
+    unmodelled = {
         name: float(getattr(priors, row.prior))
         for name, row in EFFECTS.items()
-        if row.prior and name not in asked.names
+        if row.prior and name not in question.names
     }
     return replace(
-        asked,
+        question,
         systematic={name: deviation for name, deviation in estimated.items() if deviation > 0.0},
-        allowed={name: deviation for name, deviation in allowed.items() if deviation > 0.0},
+        unmodelled={name: deviation for name, deviation in unmodelled.items() if deviation > 0.0},
     )

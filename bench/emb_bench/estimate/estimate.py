@@ -17,7 +17,7 @@ from emb_bench.estimate.intervals import deviations, largest, unnoticed
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import NORMAL_95, Contribution, End, EstimationProblem, ModelValidation, Unknown
 from emb_bench.experiment.experiment import Experiment
-from emb_bench.information.identifiability import Identifiability, Spectrum, judge, schur_complement
+from emb_bench.information.identifiability import Identifiability, Spectrum, identifiability, schur_complement
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 
 OF_THE_BENCH = ("J", *SCALES)  # Effects that all runs on one bench share
@@ -37,14 +37,14 @@ class Estimate:
     """Parameters from experiments."""
 
     problem: Problem  # Its plant has the features that were estimated
-    z: Floats  # The unknowns, in the coordinates of ``problem``
+    z: Floats  # Unknowns in the coordinates of ``problem``
     information: Floats
-    """Physical FIM at the estimate, relative parameters, with the priors, and with what averaging says of the
-    systematic errors (:mod:`emb_bench.estimate.average`): the inverse covariance of the estimate."""
-    samples: Floats  # Information of the samples alone
-    prior: Floats | None  # That of the priors in full
+    """Physical FIM at the estimate, relative parameters, with the priors, those of systematic errors averaged
+    (:mod:`emb_bench.estimate.average`): the inverse covariance of the estimate."""
+    samples: Floats  # FIM of the samples alone
+    prior: Floats | None  # FIM of the priors in full
     sandwich: Floats
-    """Covariance from the residuals, relative parameters: right too if the noise differs from the bench's."""
+    """Covariance from the residuals, relative parameters: consistent also if the noise is not the bench's."""
     validation: ModelValidation
     ends: tuple[End, ...]  # Of all local searches, best first
     residuals: tuple[Floats, ...] = field(repr=False)
@@ -53,9 +53,9 @@ class Estimate:
     process_noise: float = 0.0
     """Standard deviation of the velocity's random walk, as the prediction error method estimates it [rad/s per √s]."""
     load_noise: float = 0.0
-    """Standard deviation of the load's random walk, as a current, as it estimates that [A per √s]."""
-    windows: int = 0  # Windows with starts of their own; 0 of a method without
-    ideal_sensors: bool = False  # Systematic errors were asked for, and the method has no unknowns for them
+    """Standard deviation of the load's random walk, as a current, by the same method [A per √s]."""
+    windows: int = 0  # Number of windows; 0 for a method without windows
+    ideal_sensors: bool = False  # Systematic errors were requested, but the method cannot estimate them
 
     @property
     def bench(self) -> Bench:
@@ -73,9 +73,9 @@ class Estimate:
         return self.problem.experiments
 
     @property
-    def asked(self) -> EstimationProblem:
-        """The unknowns that were asked for."""
-        return self.problem.asked
+    def question(self) -> EstimationProblem:
+        """Parameters of interest, nuisances and priors."""
+        return self.problem.question
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
@@ -99,7 +99,7 @@ class Estimate:
 
     @property
     def at_bound(self) -> tuple[str, ...]:
-        """Labels of the unknowns that ended at the border of what is searched."""
+        """Labels of the unknowns that ended at the border of the search range."""
         return tuple(label for label, at in zip(self.labels, self.problem.at_border(self.fit), strict=True) if at)
 
     @property
@@ -130,12 +130,12 @@ class Estimate:
 
     def deviations(self) -> Floats:
         """Total standard deviations, by the rules of :mod:`emb_bench.estimate.intervals`."""
-        return deviations(self.cramer_rao(), self.open(), self.robust(), fits=self.validation.fits)
+        return deviations(self.cramer_rao(), self.unmodelled_bias(), self.robust(), fits=self.validation.fits)
 
     def covariance(self) -> Floats:
-        """Total covariance, whose diagonal has the squares of :meth:`deviations`; in the same units.
+        """Total covariance, with the squares of :meth:`deviations` on the diagonal; in the same units.
 
-        By the information, and by each effect of the budget, which moves all unknowns together.
+        Inverse information plus one term of rank one for each effect of the budget, which biases all unknowns at once.
         """
         biases = np.array([one.bias for one in self.validation.budget]).reshape(-1, len(self.unknowns))
         covariance = Spectrum(self.information).inverse() + biases.T @ biases
@@ -145,15 +145,17 @@ class Estimate:
         return total
 
     def between_runs(self) -> Floats:
-        """Deviations of values that are compared: the total without errors that all runs on one bench share."""
-        return deviations(self.cramer_rao(), self.open(OF_THE_BENCH), self.robust(), fits=self.validation.fits)
+        """Total deviations without the errors that all runs on one bench share, to compare runs."""
+        return deviations(
+            self.cramer_rao(), self.unmodelled_bias(OF_THE_BENCH), self.robust(), fits=self.validation.fits
+        )
 
-    def open(self, shared: Sequence[str] = ()) -> Floats:
-        """Root mean square bias of each unknown by effects that are not estimated, but those ``shared``."""
-        return unnoticed(self.validation.budget, len(self.unknowns), shared)
+    def unmodelled_bias(self, without: Sequence[str] = ()) -> Floats:
+        """Root mean square bias of each unknown by unmodelled effects, except those ``without``."""
+        return unnoticed(self.validation.budget, len(self.unknowns), without)
 
     def ratios(self) -> list[Ratio]:
-        """Ratios of the parameters to J: no error of J is in them."""
+        """Ratios of the parameters to J, which an error of J does not change."""
         inertia = [i for i, unknown in enumerate(self.unknowns) if unknown.name == "J"]
         over, found = quantity(self.bench.machine, "J"), []
         for i, name in enumerate(unknown.name for unknown in self.unknowns):
@@ -171,7 +173,7 @@ class Estimate:
             )
         return found
 
-    def left_open_by(self, i: int) -> Contribution | None:
+    def largest_bias(self, i: int) -> Contribution | None:
         """The largest entry of the uncertainty budget of unknown ``i``; None without any."""
         return largest(self.validation.budget, i)
 
@@ -192,28 +194,28 @@ class Estimate:
         """Indices of the unknowns that all experiments share."""
         return [i for i, unknown in enumerate(self.unknowns) if unknown.experiment is None]
 
-    def wanted(self) -> list[int]:
-        """Indices of the unknowns that were asked for: all but the systematic errors that are estimated too."""
-        return [i for i, unknown in enumerate(self.unknowns) if unknown.name not in self.asked.along]
+    def requested(self) -> list[int]:
+        """Indices of the requested unknowns: all but the default nuisances."""
+        return [i for i, unknown in enumerate(self.unknowns) if unknown.name not in self.question.default_nuisances]
 
     def shared_information(self) -> Floats:
         """FIM of the shared unknowns when those of single experiments are unknown too; relative, prior included."""
         return schur_complement(self.information, self.shared())
 
-    def verdict(self) -> Identifiability:
-        """Identifiability of each unknown that was asked for; of several experiments, of those that they share."""
+    def identifiability(self) -> Identifiability:
+        """Identifiability of the requested unknowns; of several experiments, of those that they share."""
         shared = [i for i, u in enumerate(self.unknowns) if u.experiment is None or len(self.experiments) == 1]
         if not shared:
             return Identifiability((), (), ())
         matrix = schur_complement(self.information, shared)
-        prior = None if self.asked.prior is None or self.prior is None else self.prior[np.ix_(shared, shared)]
-        found = judge(matrix, [self.unknowns[i].name for i in shared], prior)
-        wanted = replace(found, findings=tuple(f for f in found.findings if f.name not in self.asked.along))
-        return wanted.shown(self.bench.machine)
+        prior = None if self.question.prior is None or self.prior is None else self.prior[np.ix_(shared, shared)]
+        found = identifiability(matrix, [self.unknowns[i].name for i in shared], prior)
+        requested = tuple(f for f in found.findings if f.name not in self.question.default_nuisances)
+        return replace(found, findings=requested).renamed(self.bench.machine)
 
     @property
-    def shown(self) -> tuple[Quantity, ...]:
-        """Names and units in which the unknowns are shown, in their order."""
+    def quantities(self) -> tuple[Quantity, ...]:
+        """Names and units of the unknowns for output, in their order."""
         return tuple(quantity(self.bench.machine, unknown.name) for unknown in self.unknowns)
 
     def label(self, unknown: Unknown) -> str:

@@ -1,14 +1,14 @@
 """Expected interval of an estimate, before there is a record: by the rules of the estimator.
 
 The unknowns are those of ``estimate``: the parameters and the systematic errors of the bench with their priors, and the
-start of the brake, whose angle at rest is a measurement. The estimate is averaged over whether each error is there
-(:mod:`emb_bench.estimate.average`), and the other effects of ``[systematic]`` move it as the budget of the uncertainty
-says (:mod:`emb_bench.estimate.suspects`). The brake has none of them: the score of an effect is Gaussian with the
-variance of its information, and its square counts with its mean.
+start of the brake, whose angle at rest is a measurement. The estimate is averaged over the presence of each error
+(:mod:`emb_bench.estimate.average`); the other effects of ``[systematic]`` bias it by their entries in the uncertainty
+budget (:mod:`emb_bench.estimate.suspects`). The simulated brake has none of these effects: the score of an effect is
+Gaussian with variance equal to its information, so the budget takes the expected square of the score.
 
-Two numbers count a whole experiment [nat], more is better. They add −2 ln of the relative deviations of the parameters:
-I of the repeatability, T of the interval between runs, which is wider by all effects but those that all runs on one
-bench share.
+Two criteria rate an experiment [nat], more is better. Each is a sum of −2 ln of the parameters' relative deviations: I
+of the repeatability, T of the interval between runs, which is wider by all effects but those common to all runs on one
+bench.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from emb_bench.brake.motion import Floats
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Plant
 from emb_bench.estimate.average import average
-from emb_bench.estimate.effects import Simulated, columns, lacked_sensitivities, with_systematic
+from emb_bench.estimate.effects import Simulation, columns, lacked_sensitivities, with_systematic
 from emb_bench.estimate.estimate import OF_THE_BENCH
 from emb_bench.estimate.intervals import largest, unnoticed
 from emb_bench.estimate.prediction import Problem, make_problem
@@ -43,16 +43,16 @@ NUMBERS = ("T", "I")
 
 @dataclass(frozen=True, eq=False)
 class Interval:
-    """Standard deviations of the estimates of some unknowns, relative or in their units."""
+    """Standard deviations of estimates, relative or in the unknowns' units."""
 
     names: tuple[str, ...]
-    count: int  # Of the first of them, the parameters that are of interest
+    count: int  # Number of parameters of interest, which come first
     covariance: Floats  # Of the noise alone, averaged over systematic errors, shape (p, p)
-    budget: tuple[Contribution, ...]  # Root mean square biases by effects that are not estimated
+    budget: tuple[Contribution, ...]  # Root mean square biases by unmodelled effects
 
     @cached_property
     def repeatability(self) -> Floats:
-        """Deviations by the noise alone, inf where nothing is known."""
+        """Deviations by the noise alone, inf if not identified."""
         deviations: Floats = np.sqrt(np.diag(self.covariance))
         return deviations
 
@@ -68,12 +68,12 @@ class Interval:
 
     @property
     def of_repeatability(self) -> float:
-        """I [nat]; −inf where nothing is known of a parameter."""
+        """I [nat]; −inf if a parameter is not identified."""
         return -2.0 * float(np.log(self.repeatability[: self.count]).sum())
 
     @property
     def of_comparison(self) -> float:
-        """T [nat]; −inf where nothing is known of a parameter."""
+        """T [nat]; −inf if a parameter is not identified."""
         return -2.0 * float(np.log(self.between_runs[: self.count]).sum())
 
     def largest(self, i: int, shared: Sequence[str] = OF_THE_BENCH) -> Contribution | None:
@@ -87,7 +87,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class IntervalCriterion:
-    """Criterion of a search for an experiment [nat]: T, I, or the share in T of one parameter, by its name."""
+    """Criterion of an experiment [nat]: T, I, or the share of one parameter in T, by its name."""
 
     name: str
 
@@ -98,7 +98,7 @@ class IntervalCriterion:
         return -2.0 * math.log(interval.between_runs[interval.names.index(self.name)])
 
     def value(self, phi: float) -> float:
-        """The criterion in its own unit."""
+        """The criterion in the unit that is printed, here [nat]."""
         return phi
 
     @property
@@ -108,9 +108,9 @@ class IntervalCriterion:
 
 
 def of_information(e: Information) -> Interval:
-    """The interval that the experiment of an information leads to, at its parameters and with its unknowns.
+    """The interval of the experiment of an information, at its parameters and with its unknowns.
 
-    Of planned currents each sample counts; of a recorded experiment those that were received.
+    With planned currents every sample counts; of a recorded experiment, the samples received.
 
     Raises:
         UsageError: the information is of several runs, or the model cannot estimate these unknowns.
@@ -141,32 +141,33 @@ def of_experiment(
 ) -> Interval:
     """The interval of an experiment with a brake; its samples say which were received, and where a gap ended."""
     bench = replace(bench, brake=brake)
-    asked = with_systematic(EstimationProblem(question.params, question.nuisances, question.prior), bench, plant)
-    problem = make_problem(bench, plant, [experiment.seen_by(plant)], asked)
-    z, known = problem.nominal(), {name: value for name, value in errors._asdict().items() if value is not None}
+    parameters = EstimationProblem(question.params, question.nuisances, question.prior)
+    full = with_systematic(parameters, bench, plant)
+    problem = make_problem(bench, plant, [experiment.seen_by(plant)], full)
+    z, given = problem.nominal(), {name: value for name, value in errors._asdict().items() if value is not None}
     for i, unknown in enumerate(problem.unknowns):
-        z[i] = known.get(unknown.name, z[i])
+        z[i] = given.get(unknown.name, z[i])
     return of_problem(problem, z)
 
 
 def of_problem(problem: Problem, z: Floats) -> Interval:
-    """The interval of a problem of one record, without noise, that is explained by ``z``."""
-    allowed = tuple(problem.asked.allowed)
-    held = lacked_sensitivities(problem, allowed)
-    said = [problem.predict(z, i, held) for i in range(len(problem.experiments))]
-    weights = problem.weights(z, said)
-    jacobian = problem.jacobian(z, weights, said)[1]
-    averaged = average(problem, z, (np.zeros(len(jacobian)), jacobian))  # of records without noise
+    """The interval of a problem of one noise-free experiment at ``z``."""
+    effects = tuple(problem.question.unmodelled)
+    fixed = lacked_sensitivities(problem, effects)
+    trajectories = [problem.predict(z, i, fixed) for i in range(len(problem.experiments))]
+    weights = problem.weights(z, trajectories)
+    jacobian = problem.jacobian(z, weights, trajectories)[1]
+    averaged = average(problem, z, (np.zeros(len(jacobian)), jacobian))  # without noise the residuals are zero
     basis, inverse = basis_and_inverse(jacobian)
     if any(experiment.gap_unknowns for experiment in problem.experiments):
         basis = np.concatenate([basis, problem.gap_basis(z, weights)], axis=1)
-    shown = Simulated(problem, z, weights, said, held)
-    found = lacking(columns(problem, z, shown, jacobian, allowed), basis, inverse)
+    prediction = Simulation(problem, z, weights, trajectories, fixed)
+    found = lacking(columns(problem, z, prediction, jacobian, effects), basis, inverse)
     information = np.sum(found.beside**2, axis=1)
     budget = budget_of(problem, averaged, found, information, np.sqrt(information))
     covariance = Spectrum(jacobian.T @ jacobian + averaged.added()).inverse()
-    unknown = [one.name for one in problem.unknowns]
-    wanted = [i for i, name in enumerate(unknown) if name not in problem.asked.along]
-    own = tuple(replace(one, bias=tuple(one.bias[i] for i in wanted)) for one in budget)
-    names = tuple(unknown[i] for i in wanted)
-    return Interval(names, len(problem.asked.params), covariance[np.ix_(wanted, wanted)], own)
+    unknowns = [one.name for one in problem.unknowns]
+    index = [i for i, name in enumerate(unknowns) if name not in problem.question.default_nuisances]
+    biases = tuple(replace(one, bias=tuple(one.bias[i] for i in index)) for one in budget)
+    names = tuple(unknowns[i] for i in index)
+    return Interval(names, len(problem.question.params), covariance[np.ix_(index, index)], biases)

@@ -3,19 +3,19 @@
 The filter predicts with the exact brake. The covariance of angle and velocity is carried through a period by the exact
 sensitivities to the state at its start, jumps at reversals included; a brake that sticks forgets its velocity. Between
 samples the velocity does a random walk of q rad/s per √s, a white torque as seen by the inertia, which over a period T
-adds q² [[T³/3, T²/2], [T²/2, T]] to the covariance. A load that does a random walk itself is a third state, from zero
-on: a current d that acts besides, of r A per √s, whose effect is the exact sensitivity to a current offset. Where the
-brake is in its hysteresis or play, and the current of a motor that lags, are taken as the model has them.
+adds q² [[T³/3, T²/2], [T²/2, T]] to the covariance. A load with a random walk of r A per √s is a third state, an added
+current d that begins at zero; its effect is the exact sensitivity to a current offset. The state of hysteresis or play
+and a lagging current are those of the model, without covariance.
 
-The outputs of a sample are taken one after the other, which whitens them as the Cholesky factor of their covariance
-does. One that was lost, or that does not count, is predicted through. In a period of which no report says what acted,
-the current is unknown by as much as the bench's limit: what it does to a free inertia adds to the covariance.
+The filter updates with one output of a sample after the other, which whitens them as the Cholesky factor of their
+covariance does. A lost sample has no update. In a period without report the current has the bench's limit as standard
+deviation; its effect on a free inertia adds to the covariance.
 
-**Derivatives** are those of the innovations with the gains held: then the sensitivities s of the state obey the update
-s ← (I − K H) s, exactly. What they leave out, the dependence of the gains on the unknowns, multiplies white noise.
+**Derivatives** of the innovations are taken with fixed gains: the update of the state's sensitivities is then exactly
+s ← (I − K H) s. The neglected derivatives of the gains multiply white noise.
 
-Without disturbance, with a known start and where every report came the gains are zero, and the innovations are the
-residuals of output error.
+Without disturbance, with a given start and with all reports the gains are zero, and the innovations are the residuals
+of output error.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ class Filter:
     def gains(self, z: Floats, weights: Sequence[Floats]) -> list[Floats]:
         """Gains of each experiment along the motion for ``z``, shape (n, 2, 4), in the order of ``GAIN``."""
         gains = [np.zeros((*root.shape, GAIN)) for root in weights]
-        self._parts(z, weights, gains, held=False)
+        self._parts(z, weights, gains, fixed=False)
         return gains
 
     def jacobian(self, z: Floats, weights: Sequence[Floats], gains: Sequence[Floats]) -> tuple[Floats, Floats]:
         """Whitened innovations with these gains, and their derivatives to z, as :meth:`Problem.jacobian`."""
-        return self.problem.stacked(z, self._parts(z, weights, gains, held=True))
+        return self.problem.stacked(z, self._parts(z, weights, gains, fixed=True))
 
     def deviance(self, z: Floats, weights: Sequence[Floats]) -> float:
         """Minus twice the logarithm of the likelihood, prior included, but for a constant."""
@@ -70,10 +70,10 @@ class Filter:
         return float(errors @ errors) + growth
 
     def _parts(
-        self, z: Floats, weights: Sequence[Floats], gains: Sequence[Floats], *, held: bool
+        self, z: Floats, weights: Sequence[Floats], gains: Sequence[Floats], *, fixed: bool
     ) -> list[tuple[Floats, Floats]]:
         pairs = enumerate(zip(weights, gains, strict=True))
-        return [self.followed(z, i, root, gain, held=held) for i, (root, gain) in pairs]
+        return [self.followed(z, i, root, gain, fixed=fixed) for i, (root, gain) in pairs]
 
     def followed(
         self,
@@ -82,24 +82,24 @@ class Filter:
         root: Floats,
         gain: Floats,
         *,
-        held: bool = True,
+        fixed: bool = True,
         besides: tuple[str, ...] = (),
         mechanics: Mechanics | None = None,
         parts: tuple[Integers, Floats] | None = None,
         shifted: Floats | float = 0.0,
     ) -> tuple[Floats, Floats]:
-        """Innovations of experiment ``i`` over their standard deviations, and what unknowns add to what is shown.
+        """Whitened innovations of experiment ``i``, and whitened derivatives of the prediction to its unknowns.
 
         Args:
             z: the unknowns.
             i: number of the experiment.
             root: inverse standard deviations of its samples, shape (n, 2).
-            gain: its gains, shape (n, 2, 4); become those if they are not held.
-            held: True if the gains are given.
-            besides: further unknowns, which come after those of ``z``.
-            mechanics: how another brake moves; without, that of ``z``.
-            parts: unknowns that come last, and the share by which each counts in a period, shape (n, m).
-            shifted: what is added to the samples, shape (n, 2).
+            gain: its gains, shape (n, 2, 4); computed in place unless ``fixed``.
+            fixed: True if the gains are given.
+            besides: further unknowns, after those of ``z``.
+            mechanics: other mechanics than those of ``z``.
+            parts: unknowns that come last, and their weights in each period, shape (n, m).
+            shifted: change of the samples, shape (n, 2).
 
         Returns:
             Shapes (n, 2) and (n, unknowns, 2).
@@ -107,9 +107,9 @@ class Filter:
         problem, experiment = self.problem, self.problem.experiments[i]
         n, names = len(experiment.currents), (*problem.names(i), *besides)
         at = problem.at(z, i)
-        x, chosen, s = at.begin(experiment.before, (*START, *names))
+        x, unknowns, s = at.begin(experiment.before, (*START, *names))
         in_part, counted = (np.zeros(0, np.int64), np.zeros((n, 0))) if parts is None else parts
-        chosen, s = np.append(chosen, in_part), np.pad(s, ((0, len(in_part)), (0, 0)))
+        unknowns, s = np.append(unknowns, in_part), np.pad(s, ((0, len(in_part)), (0, 0)))
         innovations, shares = np.zeros((n, 2)), np.zeros((n, len(names) + len(in_part), 2))
         given = FilterInput(
             experiment.currents + at.errors.current_offset,
@@ -129,31 +129,31 @@ class Filter:
         moves, results = problem.mechanics(z) if mechanics is None else mechanics, Innovations(innovations, shares)
         covariance = self._uncertainty(i)
         loop = compiled(march_filtered)
-        loop(moves, at.brake, given, chosen, x, s, covariance, held, gain, results)
+        loop(moves, at.brake, given, unknowns, x, s, covariance, fixed, gain, results)
         if at.errors.delay < 0.0:  # to first order, as in the simulation
             innovations -= at.errors.delay * shares[:, names.index("delay")]
         return innovations, shares
 
     def _unreported(self, experiment: int) -> Floats:
-        """Variances of the currents of an experiment, zero where a report says what acted [A²], shape (n,)."""
+        """Variances of the currents of an experiment [A²], zero in periods with a report, shape (n,)."""
         data = self.problem.experiments[experiment]
         lost = np.zeros(len(data.currents)) if data.assumed is None else np.isfinite(data.assumed)
         return self.problem.bench.limits.current**2 * lost
 
     def _uncertainty(self, experiment: int) -> Floats:
-        """Covariance of angle, velocity and load at the start: of what was measured and is not estimated."""
-        data, asked = self.problem.experiments[experiment], self.problem.names(experiment)
+        """Covariance of angle, velocity and load at the start; zero for what is estimated or exact."""
+        data, names = self.problem.experiments[experiment], self.problem.names(experiment)
         covariance = np.zeros((3, 3))
-        if not data.from_origin and "x1_0" not in asked and "offset" not in asked:
+        if not data.from_origin and "x1_0" not in names and "offset" not in names:
             covariance[0, 0] = data.slack**2
-        if data.velocity != 0.0 and "x2_0" not in asked:
+        if data.velocity != 0.0 and "x2_0" not in names:
             covariance[1, 1] = self.problem.bench.noise.velocity**2
         return covariance
 
 
 @dataclass(frozen=True, eq=False)
-class Followed:
-    """Innovations at an estimate, as score tests take them: :class:`emb_bench.estimate.suspects.Shown`."""
+class FilterPrediction:
+    """Prediction of a filter at an estimate, a :class:`emb_bench.estimate.effects.Prediction`: one step ahead."""
 
     filter: Filter
     z: Floats
@@ -161,23 +161,23 @@ class Followed:
     gains: Sequence[Floats]
 
     def columns(self, experiment: int, names: tuple[str, ...]) -> Floats:
-        """Derivatives of what is shown to other unknowns, in standard deviations, shape (n, names, 2)."""
+        """As :class:`~emb_bench.estimate.effects.Prediction`."""
         return self._followed(experiment, besides=names)[1][:, -len(names) :]
 
     def parts(self, experiment: int, unknowns: Integers, shares: Floats) -> Floats:
-        """Derivatives to unknowns that count by shares, in standard deviations, shape (n, m, 2)."""
+        """As :class:`~emb_bench.estimate.effects.Prediction`."""
         return self._followed(experiment, parts=(unknowns, shares))[1][:, -len(unknowns) :]
 
-    def shown(self, experiment: int, mechanics: Mechanics) -> Floats:
-        """Expected less measured samples of another brake under the same currents, whitened."""
+    def whitened_samples(self, experiment: int, mechanics: Mechanics) -> Floats:
+        """As :class:`~emb_bench.estimate.effects.Prediction`, less the samples, which cancel in differences."""
         return -self._followed(experiment, mechanics=mechanics)[0]
 
     def whitened(self, experiment: int, shift: Floats) -> Floats:
-        """A small change of what is shown, shape (n, 2), as the innovations have it."""
+        """As :class:`~emb_bench.estimate.effects.Prediction`."""
         return self._followed(experiment, shifted=shift)[0] - self._followed(experiment)[0]
 
     def motion(self, experiment: int) -> Floats:
-        """Angle and velocity that are expected of each sample from those before, shape (n, 2)."""
+        """Prediction of each sample from those before, shape (n, 2)."""
         root, scale = self.weights[experiment], self.gains[experiment][:, :, 2]
         innovations, _ = self._followed(experiment)
         expected, instants = np.zeros_like(root), np.arange(len(root))
@@ -200,60 +200,60 @@ class FilterInput(NamedTuple):
     currents: Floats  # [A], shape (n,)
     t_s: float  # Period [s]
     late: float  # Share of the period in which the command before still acts
-    delay: int  # Periods that a sample waits before it is sent
+    delay: int  # Periods between sampling and sending
     samples: Floats  # Angle [rad] and velocity [rad/s], shape (n, 2)
     stamps: Floats  # Lateness of each sample after the grid [s], shape (n,)
-    unreported: Floats  # Variances of the currents, zero where what acted is known [A²], shape (n,)
+    unreported: Floats  # Variances of the currents [A²], zero with a report, shape (n,)
     root: Floats  # Inverse standard deviations of the samples, zero where one does not count, shape (n, 2)
     bias: float  # Reading at the angle zero [rad]
     velocity_scale: float  # Reading at a velocity of 1 rad/s [rad/s]
     walk: float  # q [rad/s per √s]
     load: float  # r [A per √s]
-    parts: Floats  # Shares by which the last of the unknowns count in each period, shape (n, m)
+    parts: Floats  # Weights of the last unknowns in each period, shape (n, m)
 
 
 class Innovations(NamedTuple):
     """Results of a filter."""
 
     errors: Floats  # Innovations over their standard deviations, shape (n, 2)
-    shares: Floats  # Of the unknowns after ``START``, what each adds to the reading, likewise, shape (n, unknowns, 2)
+    shares: Floats  # Derivatives of the reading to the unknowns after ``START``, likewise, shape (n, unknowns, 2)
 
 
 def march_filtered(
     mechanics: Mechanics,
     p: BrakeParameters,
     given: FilterInput,
-    chosen: Integers,
+    unknowns: Integers,
     x: Floats,
     s: Floats,
     covariance: Floats,
-    held: bool,
+    fixed: bool,
     gains: Floats,
     results: Innovations,
 ) -> None:
     """One experiment through the filter, which corrects the state between two periods; runs as it is or compiled.
 
-    The unknowns ``chosen`` begin with ``START``. State ``x``, its sensitivities ``s``, the ``covariance`` of angle,
-    velocity and load, shape (3, 3), and ``results`` change in place; so do the ``gains``, unless they are ``held``.
+    The ``unknowns`` begin with ``START``. State ``x``, its sensitivities ``s``, the ``covariance`` of angle, velocity
+    and load, shape (3, 3), and ``results`` change in place; so do the ``gains``, unless they are ``fixed``.
     """
     currents, t_s, late, delay, samples, stamps, unreported, root, bias, velocity_scale, walk, load, parts = given
     innovations, shares = results
-    before, acting, known, every = float(x[3]), 0.0, len(START), chosen.copy()
-    follows = np.zeros(chosen.shape[0])  # derivatives of the load
+    before, acting, first, every = float(x[3]), 0.0, len(START), unknowns.copy()
+    follows = np.zeros(unknowns.shape[0])  # derivatives of the load
     for i in range(currents.shape[0]):
         k, acceleration, tau = i - delay, 0.0, stamps[i]
         if k >= 0:  # the first samples are of the brake at its start
             u, velocity = float(currents[k]), float(x[1])
-            for j in range(known):
+            for j in range(first):
                 for m in range(s.shape[1]):
                     s[j, m] = 0.0
             s[0, 0] = s[1, 1] = 1.0
-            advance_shares(mechanics, p, x, before + acting, u + acting, t_s, late, chosen, parts, k, every, s)
+            advance_shares(mechanics, p, x, before + acting, u + acting, t_s, late, unknowns, parts, k, every, s)
             before = u
-            for j in range(known, chosen.shape[0]):
+            for j in range(first, unknowns.shape[0]):
                 s[j, 0] += s[2, 0] * follows[j]
                 s[j, 1] += s[2, 1] * follows[j]
-            if not held:
+            if not fixed:
                 _spread(covariance, s, walk * walk, load * load, t_s)
                 _push(covariance, unreported[k], p.k_m / p.J * t_s, t_s)
             acceleration = (x[1] - velocity) / t_s
@@ -262,14 +262,14 @@ def march_filtered(
                 continue
             shown = reading(x[0], x[1], acceleration, tau, bias, velocity_scale)[output]
             h1, h2 = (1.0, tau) if output == 0 else (0.0, velocity_scale)
-            if not held:
+            if not fixed:
                 _weigh(covariance, h1, h2, 1.0 / root[i, output] ** 2, gains[i, output])
             k1, k2, scale, k3 = gains[i, output, 0], gains[i, output, 1], gains[i, output, 2], gains[i, output, 3]
             surprise = samples[i, output] - shown
             innovations[i, output] = surprise * scale
-            for j in range(known, chosen.shape[0]):
-                share = h1 * s[j, 0] + h2 * s[j, 1] + sensor_share(int(chosen[j]), output, shown / velocity_scale)
-                shares[i, j - known, output] = share * scale / delay_share(int(chosen[j]), late)
+            for j in range(first, unknowns.shape[0]):
+                share = h1 * s[j, 0] + h2 * s[j, 1] + sensor_share(int(unknowns[j]), output, shown / velocity_scale)
+                shares[i, j - first, output] = share * scale / delay_share(int(unknowns[j]), late)
                 s[j, 0] -= k1 * share
                 s[j, 1] -= k2 * share
                 follows[j] -= k3 * share
@@ -310,7 +310,7 @@ def _copy(source: Floats, target: Floats) -> None:
 
 
 def _push(covariance: Floats, variance: float, change: float, t_s: float) -> None:
-    """Add what an unknown current of a ``variance`` [A²] does to a free inertia: one that is taken to stick may move.
+    """Add the effect of an unknown current of a ``variance`` [A²] on a free inertia, also if the model sticks.
 
     A current of 1 A changes its velocity by ``change`` in a period [rad/s].
     """
@@ -327,18 +327,18 @@ def _weigh(covariance: Floats, h1: float, h2: float, variance: float, gain: Floa
     c, k = np.empty(3), np.empty(3)
     for i in range(3):
         c[i] = covariance[i, 0] * h1 + covariance[i, 1] * h2
-    whole = h1 * c[0] + h2 * c[1] + variance
+    total = h1 * c[0] + h2 * c[1] + variance
     for i in range(3):
-        k[i] = c[i] / whole
-    kept, after = np.eye(3), np.zeros((3, 3))
+        k[i] = c[i] / total
+    reduced, after = np.eye(3), np.zeros((3, 3))
     for i in range(3):
-        kept[i, 0] -= k[i] * h1
-        kept[i, 1] -= k[i] * h2
+        reduced[i, 0] -= k[i] * h1
+        reduced[i, 1] -= k[i] * h2
     for i in range(3):
         for j in range(3):
             after[i, j] = k[i] * k[j] * variance
             for m in range(3):
                 for n in range(3):
-                    after[i, j] += kept[i, m] * covariance[m, n] * kept[j, n]
+                    after[i, j] += reduced[i, m] * covariance[m, n] * reduced[j, n]
     _copy(after, covariance)
-    gain[0], gain[1], gain[2], gain[3] = k[0], k[1], 1.0 / math.sqrt(whole), k[2]
+    gain[0], gain[1], gain[2], gain[3] = k[0], k[1], 1.0 / math.sqrt(total), k[2]

@@ -1,12 +1,12 @@
 """Rules by which an interval of an estimate is made, in the order in which they apply (docs/explanation/estimation.md).
 
-1. *The information*: a Gaussian interval with the covariance that is averaged over whether systematic errors are there.
-2. *What may have gone unnoticed*: the largest bias that one unmodelled effect may have caused is added in quadrature.
+1. *The information*: a Gaussian interval with the covariance averaged over the presence of systematic errors.
+2. *Unmodelled effects*: their root mean square biases are added in quadrature.
 3. *A model that does not fit*: the deviation is at least that of the sandwich, which the residuals give.
 4. *The likelihood profile*, where one was made, takes the interval's place if it is not closed, or if its assumptions
    hold: the model fits, and the method is output error. Beside a bias by rule 2 the union of both counts.
-5. *Several models* that the experiments do not tell apart: the union with the interval of their mixture.
-6. *What a brake can have*: an interval ends at the least value that is possible.
+5. *Several models* that explain the experiments: the union with the interval of their mixture.
+6. *Physical bounds*: an interval ends at the least value that is possible.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def interval(gaussian: Interval, profile: Interval, *, closed: bool, holds: bool
 
 
 def bounded(interval: Interval, value: float, least: float) -> Interval:
-    """Interval of a value by rule 6; one that excludes nothing that is possible is infinite."""
+    """Interval of a value by rule 6; infinite if it excludes no possible value."""
     low, high = interval
     if not -math.inf < low < least <= value:
         return interval

@@ -4,13 +4,12 @@ Over a period the thesis's equation of motion (eq. 3.12-3.14) is linear in the f
 
     J Δω = k_m u T − γ k_1 ∫ max(x, 0) dt − T_c sign(ω) T − f_v ∫ ω dt.
 
-What is measured at both ends takes the place of the motion: differences of velocities on the left, means of both ends
-on the right. Each period in which the brake surely keeps its direction updates the estimate and its covariance
-(Ljung, System Identification, 2nd ed., section 11.2), begun at the prior or, without one, at the nominal brake with
-next to no trust in it.
+The samples at both ends replace the motion: Δω is the difference of the velocities, the integrals are means of both
+ends. Each period in which the brake surely keeps its direction updates the estimate and its covariance (Ljung, System
+Identification, 2nd ed., section 11.2). The initial values are the prior, or the nominal brake with a wide covariance.
 
-It needs no start, no search and no simulation, and it is biased: the regressors carry the sensors' noise as well. Its
-deviations do not include that; the report states it.
+The method needs no start, no search and no simulation. It is biased, because the regressors carry the sensors' noise;
+its deviations do not include this bias, and the report states it.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 
-SURE = 4.0  # Standard deviations of a velocity beyond which its sign is taken as known
+SURE = 4.0  # Standard deviations of a velocity beyond which its sign is certain
 WIDE = 1e3  # Initial standard deviation of a parameter without a prior, over its nominal value
 
 
@@ -38,7 +37,7 @@ class RecursiveLeastSquares(Method):
 
     def solve(self, problem: Problem) -> Estimate:
         """As :class:`Method`."""
-        others = [name for name in problem.asked.names if name not in PARAMETER_NAMES]
+        others = [name for name in problem.question.names if name not in PARAMETER_NAMES]
         if others:
             raise UsageError(
                 f"recursive least squares estimates {', '.join(PARAMETER_NAMES)}, not {', '.join(others)}: it follows "
@@ -67,19 +66,19 @@ class RecursiveLeastSquares(Method):
             stacked = np.concatenate([rows, np.diag(inverse)]) * unit, np.concatenate([errors, inverse * prior_mean])
             values = np.clip(lsq_linear(*stacked, bounds=(low / unit, high / unit)).x * unit, low, high)
         z = problem.coordinates(values)
-        left = errors - rows @ values
+        residuals = errors - rows @ values
         relative = rows * values
         prior = np.diag((inverse * values) ** 2)
         information = relative.T @ relative + prior
         paired = np.stack([relative, np.zeros_like(relative)], axis=1).reshape(-1, len(z))
-        known = (prior_mean - values) * inverse
+        of_prior = (prior_mean - values) * inverse
         spread = sandwich(
             information,
             np.concatenate([paired, np.diag(inverse * values)]),
-            np.concatenate([np.stack([left, np.zeros_like(left)], axis=1).ravel(), known]),
+            np.concatenate([np.stack([residuals, np.zeros_like(residuals)], axis=1).ravel(), of_prior]),
             [len(part) for part, _ in parts],
         )
-        cost = float(left @ left + known @ known)
+        cost = float(residuals @ residuals + of_prior @ of_prior)
         return finished(
             problem,
             z,
@@ -93,11 +92,11 @@ class RecursiveLeastSquares(Method):
 
 
 def regression(problem: Problem, experiment: Experiment) -> tuple[Floats, Floats]:
-    """An experiment's equations of motion, each over the deviation that the noise of the velocities gives it.
+    """An experiment's equations of motion, each divided by its standard deviation from the velocities' noise.
 
     Returns:
-        Regressors, shape (periods, unknowns), of the parameters, and what they make up, shape (periods,). Zero for a
-        period that does not count. The first one, which begins at a start that was not sampled, is not among them.
+        Regressors, shape (periods, unknowns), and the impulse that they explain, shape (periods,). Zero for a period
+        that does not count. Without the first period, whose start was not sampled.
     """
     p, t_s = problem.bench.brake, problem.bench.timing.sample_time
     delay, offset = problem.plant.instruments.measurement_delay, problem.plant.instruments.encoder_offset
@@ -112,23 +111,23 @@ def regression(problem: Problem, experiment: Experiment) -> tuple[Floats, Floats
         "T_c": -sign * t_s,
         "f_v": -mean[:, 1] * t_s,
     }
-    known = sum(getattr(p, n) * v for n, v in impulses.items() if n not in problem.asked.names)
-    whole = p.J * (ended[:, 1] - begun[:, 1]) - known
-    rows = np.stack([impulses[name] for name in problem.asked.names], axis=1)
+    fixed = sum(getattr(p, n) * v for n, v in impulses.items() if n not in problem.question.names)
+    impulse = p.J * (ended[:, 1] - begun[:, 1]) - fixed
+    rows = np.stack([impulses[name] for name in problem.question.names], axis=1)
     reported = True if experiment.assumed is None else np.isnan(experiment.assumed[1 : len(seen)])
     with np.errstate(invalid="ignore"):  # a lost sample compares as not sure
         moves = np.minimum(begun[:, 1] * sign, ended[:, 1] * sign) > SURE * noise
     counts = moves & np.isfinite(mean[:, 0]) & reported
     deviation = np.sqrt(2.0) * p.J * noise
-    return np.where(counts[:, None], rows / deviation, 0.0), np.where(counts, whole / deviation, 0.0)
+    return np.where(counts[:, None], rows / deviation, 0.0), np.where(counts, impulse / deviation, 0.0)
 
 
 def beginning(problem: Problem) -> tuple[Floats, Floats]:
     """Mean and covariance of the parameters before the first period."""
     mean, inverse = problem.prior
-    nominal, known = problem.values(problem.nominal()), inverse > 0.0
-    deviation = np.where(known, 1.0 / np.where(known, inverse, 1.0), WIDE * nominal)
-    return np.where(known, mean, nominal), np.diag(deviation**2)
+    nominal, with_prior = problem.values(problem.nominal()), inverse > 0.0
+    deviation = np.where(with_prior, 1.0 / np.where(with_prior, inverse, 1.0), WIDE * nominal)
+    return np.where(with_prior, mean, nominal), np.diag(deviation**2)
 
 
 def recursion(rows: Floats, errors: Floats, z: Floats, covariance: Floats) -> Floats:
@@ -137,9 +136,9 @@ def recursion(rows: Floats, errors: Floats, z: Floats, covariance: Floats) -> Fl
     Begins at the mean ``z`` and its ``covariance``.
     """
     for row, value in zip(rows, errors.tolist(), strict=True):
-        along = covariance @ row
-        gain = along / (1.0 + float(row @ along))
+        cross = covariance @ row
+        gain = cross / (1.0 + float(row @ cross))
         z = z + gain * (value - float(row @ z))
-        held = np.eye(len(z)) - np.outer(gain, row)
-        covariance = held @ covariance @ held.T + np.outer(gain, gain)  # Joseph's form stays positive
+        reduced = np.eye(len(z)) - np.outer(gain, row)
+        covariance = reduced @ covariance @ reduced.T + np.outer(gain, gain)  # Joseph's form stays positive
     return z

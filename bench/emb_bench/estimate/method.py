@@ -22,28 +22,28 @@ class Method(ABC):
 
     bench: Bench  # Noise, sample time, nominal brake, and ranges in which searches begin where there is no prior
     plant: Plant  # The model
-    asked: EstimationProblem = field(default_factory=EstimationProblem)  # The parameters to estimate
+    question: EstimationProblem = field(default_factory=EstimationProblem)  # Unknowns and priors
     starts: int = STARTS  # Local searches; recursive least squares needs none
     seed: int = 0  # Of the random numbers
     systematic: ClassVar[bool] = False  # Systematic errors are among its unknowns
 
     def fit(self, experiments: Sequence[Experiment]) -> Estimate:
         """Estimate from one experiment, or from several of the same brake."""
-        asked, ideal_sensors = self.asked, False
-        if asked.known and not self.systematic:
+        question, ideal_sensors = self.question, False
+        if question.known and not self.systematic:
             raise UsageError(
                 "this method takes no known parameter: leave out --known, or k_m in [systematic]; or use --method oem"
             )
-        if (asked.systematic or asked.allowed) and not self.systematic:
-            asked, ideal_sensors = replace(asked, systematic={}, allowed={}), True
-        if absent := [name for name in asked.names if getattr(self.bench.brake, name, 1.0) == 0.0]:
+        if (question.systematic or question.unmodelled) and not self.systematic:
+            question, ideal_sensors = replace(question, systematic={}, unmodelled={}), True
+        if absent := [name for name in question.names if getattr(self.bench.brake, name, 1.0) == 0.0]:
             others = () if self.bench.machine is None else self.bench.machine.unknown
             raise UsageError(
                 f"{', '.join(absent)}: zero in this bench, and a share of zero says nothing: expected --params "
                 f"{','.join(others) or 'without it'}"
             )
         return replace(
-            self.solve(make_problem(self.bench, self.plant, experiments, asked)), ideal_sensors=ideal_sensors
+            self.solve(make_problem(self.bench, self.plant, experiments, question)), ideal_sensors=ideal_sensors
         )
 
     @abstractmethod

@@ -2,7 +2,7 @@
 
     OutputError(bench, plant, EstimationProblem(("k_m", "T_c"))).fit(experiments)
 
-Each class is in a module of its own, which imports scipy and numba; :func:`method_of` imports one by its name.
+Each class has its module, which imports scipy and numba; :func:`method_of` imports it.
 """
 
 from __future__ import annotations

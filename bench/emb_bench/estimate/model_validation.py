@@ -1,21 +1,19 @@
-"""Model validation: tests of whether the model explains the experiment, before any number is used.
+"""Model validation: residual tests of the model, before any number is used.
 
-With the bench's noise known, three questions have a distribution under the right model:
+With the noise of the bench file three statistics have a known distribution under the right model:
 
-- *How large* are the residuals: their sum of squares is χ² with as many degrees of freedom as samples less unknowns.
-- *Do they follow from the input*: the currents of the last periods explain no more of them than chance lets them, an F
-  test on the residuals and on what is left of the lagged currents beside the model's own sensitivities, whose part the
-  fit has already taken out. Only currents that acted before a sample count: under feedback later ones depend on it. It
-  is a question of shape and holds if the noise is larger than the bench says.
-- *Do they follow from each other*: Ljung and Box, On a measure of lack of fit in time series models, Biometrika 65,
-  1978.
+- *Size*: the sum of squares of the residuals is χ² with as many degrees of freedom as samples less unknowns.
+- *Independence of the input*: an F test of the residuals' regression on the currents of the last periods, projected
+  orthogonally to the model's sensitivities, which the fit has used up. Only currents before a sample count: under
+  feedback later currents depend on the sample. The test stays valid if the noise is larger than in the bench file.
+- *Whiteness*: Ljung and Box, On a measure of lack of fit in time series models, Biometrika 65, 1978.
 
-An output-error estimator is consistent under coloured measurement noise, so that for it the third is a note, and the
-first two raise an alarm (Ljung, System Identification, 2nd ed., section 16.6). One that whitens the residuals is
-alarmed by the third as well. The disturbance that it needs to do so is a note: it belongs to its model.
+An output-error estimator is consistent under coloured measurement noise: for it the whiteness test is a note, and the
+first two raise an alarm (Ljung, System Identification, 2nd ed., section 16.6). For an estimator that whitens the
+residuals, all three raise an alarm. The disturbance that it estimates for this is a note: it is part of its model.
 
-What the model may lack is looked for with Rao's score test: the residuals along the sensitivity to an effect that was
-not estimated, beside those that were.
+Rao's score test finds effects that the model lacks: it projects the residuals on the sensitivity to an effect,
+orthogonal to the sensitivities of the unknowns.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from emb_bench.brake.motion import Floats
-from emb_bench.estimate.effects import Shown, Simulated
+from emb_bench.estimate.effects import Prediction, Simulation
 from emb_bench.estimate.prediction import Problem, by_experiment
 from emb_bench.estimate.records import OUTPUTS, Disturbance, Independence, ModelValidation, Whiteness
 from emb_bench.estimate.suspects import DEPENDENT, cause, score
@@ -36,36 +34,35 @@ from emb_bench.estimate.suspects import DEPENDENT, cause, score
 Bools = NDArray[np.bool_]
 
 
-LEVEL = 0.01  # Chance of a false alarm of all tests together
-LAGS = 10  # Periods back in which a current may still show in a residual
-NEIGHBOURS = 20  # Lags at which residuals are compared with each other
+LEVEL = 0.01  # False-alarm probability of all tests together
+LAGS = 10  # Lagged currents of the independence test
+NEIGHBOURS = 20  # Lags of the whiteness test
 
 
-def examine(
+def validate(
     problem: Problem,
     z: Floats,
     weights: Sequence[Floats],
     found: tuple[Floats, Floats],
     disturbance: Disturbance | None = None,
-    shown: Shown | None = None,
+    prediction: Prediction | None = None,
 ) -> ModelValidation:
-    """Compare residuals at an estimate, ``found`` with their derivatives to z, with what the right model would leave.
+    """Residual tests at an estimate ``z``, where residuals and their derivatives to z are ``found``.
 
-    The ``disturbance`` is that of an estimator that whitens them, ``shown`` what is shown at the estimate; without, the
-    simulation.
+    The ``disturbance`` is that of an estimator that whitens the residuals; ``prediction`` is the simulation by default.
     """
     counts = np.concatenate([root.ravel() for root in weights]) > 0.0
     every, jacobian = found
     residuals = by_experiment(every, weights)
     e = every[: len(counts)]
-    model, whole = _basis(jacobian), float(every @ every)
+    model, squares = _basis(jacobian), float(every @ every)
     freedom = int(counts.sum()) - model.shape[1]
     count = sum(experiment.gap_unknowns for experiment in problem.experiments)
-    if count and shown is None:  # a filter has no unknowns in gaps
+    if count and prediction is None:  # a filter has no unknowns in gaps
         gaps = problem.gap_basis(z, weights)
         freedom -= taken(gaps, len(e))
         model = np.concatenate([model, gaps], axis=1)
-        whole -= float(np.sum(every[len(every) - count :] ** 2))
+        squares -= float(np.sum(every[len(every) - count :] ** 2))
     freedom = max(freedom, 1)
     chi2 = float(e @ e)
     share = _share(disturbance)
@@ -74,8 +71,8 @@ def examine(
     whiteness = {
         OUTPUTS[n]: _whiteness([r[:, n] for r in residuals], [w[:, n] > 0.0 for w in weights]) for n in outputs
     }
-    independence = {OUTPUTS[n]: _independence(problem, n, every, whole, counts, model, freedom) for n in outputs}
-    seen = shown or Simulated(problem, z, weights)
+    independence = {OUTPUTS[n]: _independence(problem, n, every, squares, counts, model, freedom) for n in outputs}
+    at = prediction or Simulation(problem, z, weights)
     disturbed = disturbance is not None and disturbance.p_value < share
     low, high = expected.tolist()
     tested = ModelValidation(
@@ -85,14 +82,14 @@ def examine(
         float(special.chdtrc(freedom, chi2)),
         whiteness,
         independence,
-        *score(problem, z, found, model, seen, chi2 / freedom, disturbed=disturbed),
+        *score(problem, z, found, model, at, chi2 / freedom, disturbed=disturbed),
     )
-    judged = _judged(tested, disturbance)
-    return replace(judged, cause=cause(judged, problem.bench.machine))
+    decided = _with_alarms(tested, disturbance)
+    return replace(decided, cause=cause(decided, problem.bench.machine))
 
 
 def _share(disturbance: Disturbance | None) -> float:
-    """Chance with which one question alone puts what the right model leaves outside of what is expected."""
+    """False-alarm probability of one test."""
     return LEVEL / (2 if disturbance is None else 4)
 
 
@@ -111,8 +108,8 @@ def significant(p_values: Mapping[str, float]) -> frozenset[str]:
     return frozenset(name for name, _ in ordered[:count])
 
 
-def _judged(m: ModelValidation, disturbance: Disturbance | None) -> ModelValidation:
-    """Tests with those that reject the model."""
+def _with_alarms(m: ModelValidation, disturbance: Disturbance | None) -> ModelValidation:
+    """The validation with the tests that reject the model."""
     tests = {"size": m.chi2_p} | {f"current of {name}": test.p_value for name, test in m.independence.items()}
     tests |= {f"score of {suspect.name}": suspect.p_value for suspect in m.suspects}
     if m.together is not None:
@@ -134,26 +131,26 @@ def _judged(m: ModelValidation, disturbance: Disturbance | None) -> ModelValidat
 
 
 def taken(gaps: Floats, samples: int) -> int:
-    """Degrees of freedom that the unknowns of gaps take: as much of each as the samples, and not an assumption, tell.
+    """Degrees of freedom of the gap unknowns: of each the part that the samples, and not the prior, determine.
 
-    The orthonormal basis of what the gaps explain, shape (m, gaps), begins with the numbers measured.
+    ``gaps`` is an orthonormal basis of their columns, shape (m, gaps); its first rows are the samples.
     """
     return round(float(np.sum(gaps[:samples] ** 2)))
 
 
 def _basis(columns: Floats) -> Floats:
-    """Orthonormal basis of a column space, without directions that rounding makes up."""
+    """Orthonormal basis of a column space, to the numerical rank."""
     lengths = np.linalg.norm(columns, axis=0)
-    kept = columns[:, lengths > 0.0] / lengths[lengths > 0.0]
-    if not kept.shape[1]:
+    scaled = columns[:, lengths > 0.0] / lengths[lengths > 0.0]
+    if not scaled.shape[1]:
         return np.zeros((len(columns), 0))
-    left, values, _ = np.linalg.svd(kept, full_matrices=False)
-    result: Floats = left[:, values > 1e-9 * values[0]]
+    vectors, values, _ = np.linalg.svd(scaled, full_matrices=False)
+    result: Floats = vectors[:, values > 1e-9 * values[0]]
     return result
 
 
 def _whiteness(series: Sequence[Floats], counts: Sequence[Bools]) -> Whiteness:
-    """Ljung-Box of several experiments; a pair of which one sample was lost does not count."""
+    """Ljung-Box test of several experiments; pairs with a lost sample do not count."""
     lags = min(NEIGHBOURS, max(1, min(len(s) for s in series) // 5))
     total = float(sum(np.sum(s**2) for s in series))
     n = int(sum(np.sum(c) for c in counts))
@@ -177,21 +174,21 @@ def lagged(currents: Floats, lags: int) -> Floats:
 def _independence(
     problem: Problem, output: int, e: Floats, squares: float, counts: Bools, model: Floats, freedom: int
 ) -> Independence:
-    """F test of an output; ``squares`` is the sum of squares of the residuals but for those of unknown currents."""
+    """F test of an output; ``squares`` is the residual sum of squares without those of the gap unknowns."""
     past = np.concatenate([lagged(experiment.currents, LAGS) for experiment in problem.experiments])
-    own = np.zeros((len(past), 2, LAGS))
-    own[:, output] = past
+    columns = np.zeros((len(past), 2, LAGS))
+    columns[:, output] = past
     regressors = np.zeros((len(e), LAGS))
-    regressors[: len(counts)] = own.reshape(-1, LAGS) * counts[:, None]
+    regressors[: len(counts)] = columns.reshape(-1, LAGS) * counts[:, None]
     lengths = np.linalg.norm(regressors, axis=0)
     scaled = regressors / np.where(lengths > 0.0, lengths, 1.0)
     beside = scaled - model @ (model.T @ scaled)
-    left, values, _ = np.linalg.svd(beside, full_matrices=False)
-    kept = left[:, values > DEPENDENT]
+    vectors, values, _ = np.linalg.svd(beside, full_matrices=False)
+    basis = vectors[:, values > DEPENDENT]
     seen = counts.reshape(-1, 2)[:, output]
     correlations = [_correlation(e[: len(counts)].reshape(-1, 2)[seen, output], past[seen, lag]) for lag in range(LAGS)]
     lag = int(np.argmax(np.abs(correlations)))
-    explained, rank = float(np.sum((kept.T @ e) ** 2)), kept.shape[1]
+    explained, rank = float(np.sum((basis.T @ e) ** 2)), basis.shape[1]
     rest = freedom - rank
     if rank == 0 or rest <= 0:
         return Independence(0.0, 1.0, correlations[lag], lag)

@@ -1,20 +1,19 @@
 """Output-error method: the parameters whose simulated angle and velocity lie nearest to the measured ones.
 
-Each sample's error counts in its standard deviation, so that with white Gaussian noise this is maximum likelihood, and
-efficient. The simulation is a plant of the bench, its derivatives are the exact sensitivities, jumps at reversals
-included, at the instants of the node's own stamps. Samples that were lost are left out; what acted in the periods
-before them is unknown (:meth:`emb_bench.estimate.prediction.Problem.jacobian`). The minimum is searched from several
-starting points, because there are local ones; and if none of them leads to a model that fits, from where a filter leads
-that follows the measured brake (:mod:`emb_bench.estimate.search`).
+Errors are weighted by the samples' standard deviations: with white Gaussian noise this is maximum likelihood, and
+efficient. The simulation is a plant of the bench at the node's time stamps; its derivatives are the exact
+sensitivities, with the jumps at reversals. Lost samples do not count; the currents of periods without report are
+unknowns (:meth:`emb_bench.estimate.prediction.Problem.jacobian`). There are local minima: the search begins at several
+points, and if no minimum fits, once more by continuation with a filter (:mod:`emb_bench.estimate.search`).
 
-**The start.** An experiment whose start cannot be distinguished from rest at the origin starts there; any other starts
-where it was measured. If ``x1_0`` or ``offset`` is unknown, the mean of the samples at rest before the experiment is
-one more measurement, of x1_0 + offset. With ``offset`` alone the brake is taken to have rested at the true origin.
+**The start.** An experiment that cannot be distinguished from rest at the origin starts there; any other starts at the
+measured angle and velocity. If ``x1_0`` or ``offset`` is unknown, the mean of the samples at rest before the experiment
+is one more measurement, of x1_0 + offset. With ``offset`` alone the brake rested at the true origin.
 
-**Outliers.** The error of a sample is compared with the median of those around it. What a model lacks bends the errors
-of many samples alike and shows in the median as well; a single wrong sample does not. One that is further off than
-``OUTLIER`` is left out, angle and velocity together: a loss that is quadratic up to there and constant beyond. Where
-more samples are than ``MOST`` of all, none is left out: then the noise or the model is not as the bench file says.
+**Outliers.** The error of a sample is compared with the median of its neighbours' errors. A lack of the model changes
+the errors of many samples alike, and so the median; a single wrong sample does not. A sample beyond ``OUTLIER`` is
+removed, angle and velocity together: a loss that is quadratic up to there and constant beyond. If more samples than the
+share ``MOST`` are beyond it, none is removed: then the noise or the model differs from the bench file.
 """
 
 from __future__ import annotations
@@ -33,24 +32,24 @@ from emb_bench.brake.motion import Floats
 from emb_bench.estimate.average import average
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.method import Method
-from emb_bench.estimate.model_validation import LEVEL, examine
+from emb_bench.estimate.model_validation import LEVEL, validate
 from emb_bench.estimate.prediction import Problem, by_experiment
 from emb_bench.estimate.records import OUTLIER, SAME, End, ModelValidation
-from emb_bench.estimate.search import EVALUATIONS, minimise, released
+from emb_bench.estimate.search import EVALUATIONS, continuation, minimise
 from emb_bench.information.identifiability import Spectrum
 from emb_runtime.errors import UsageError
 
 AROUND = 5  # Neighbours on each side
-MOST = 0.01  # Largest share of the samples that is left out
-REWEIGHTED = 3  # Rounds in which the weights follow the motion, where the clock jitters
-LEFT_OUT = 3  # Most times that outliers are looked for
+MOST = 0.01  # Largest share of samples that are removed as outliers
+REWEIGHTED = 3  # Updates of the weights along the motion, with a jittering clock
+REMOVALS = 3  # Most searches for outliers
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
     """State of output error: the problem, the weights of its samples, and the ends of local searches, best first."""
 
-    problem: Problem  # Its experiments lack outliers, and have in their gaps what was found there
+    problem: Problem  # Its experiments are without outliers, with the gap unknowns found so far
     weights: list[Floats]
     ends: tuple[End, ...]
 
@@ -61,7 +60,7 @@ class Fit:
 
     @property
     def limit(self) -> float:
-        """Sum of squares that the right model stays below."""
+        """Quantile of χ² that a right model stays below."""
         freedom = self.samples - len(self.best.z)
         return float(special.chdtri(max(freedom, 1), LEVEL / 2.0))
 
@@ -81,7 +80,7 @@ class Fit:
         return self.best.cost / max(self.samples, 1)
 
     def moved(self, best: End) -> Fit:
-        """The fit with another best end, which is that of all searches in the same minimum, too."""
+        """The fit with another best end, also for the other searches that ended in the same minimum."""
         others = [
             replace(end, z=best.z, cost=best.cost) if end.cost - self.best.cost <= SAME else end
             for end in self.ends[1:]
@@ -94,22 +93,22 @@ class Fit:
 
 
 class OutputError(Method):
-    """The simulation nearest to the samples, found from the nominal brake, from random starts, and along a filter."""
+    """Output error from the nominal brake, from random starts, and by continuation."""
 
     systematic = True
 
     def solve(self, problem: Problem) -> Estimate:
         """As :class:`Method`, in seven steps."""
-        ideal = replace(problem, asked=replace(problem.asked, systematic={}))
+        ideal = replace(problem, question=replace(problem.question, systematic={}))
         points = start_points(ideal, self.starts, self.seed)  # 1. Start at the nominal brake, and at random ones.
         fit = searched(ideal, points)  # 2. Search from each, without systematic errors.
-        fit = without_outliers(fit, points)  # 3. Leave outliers out, and search again.
+        fit = without_outliers(fit, points)  # 3. Remove outliers, and search again.
         full = with_systematic_errors(fit, problem)  # 4. Free the systematic errors, at the best minimum.
-        if not full.explains:  # 5. If that does not fit, let a filter lead to another minimum.
-            fit = along_filter(fit, points[0])
+        if not full.explains:  # 5. If that does not fit, search another minimum by continuation.
+            fit = with_continuation(fit, points[0])
             full = with_systematic_errors(fit, problem)
-        full = with_gaps(full)  # 6. Search along what happened in gaps of the reports.
-        full = reweighted(full)  # 7. Weigh the samples along the motion that was found.
+        full = with_gaps(full)  # 6. Search the gap unknowns as well.
+        full = reweighted(full)  # 7. Update the weights along the motion found.
         return full.finished()
 
 
@@ -118,7 +117,7 @@ def start_points(problem: Problem, starts: int, seed: int) -> list[Floats]:
     if starts < 1:
         raise UsageError(f"expected at least 1 start, got {starts}")
     bench, first = problem.bench, problem.nominal()
-    ranges = problem.asked.prior or bench.range_set(bench.shield.ranges)
+    ranges = problem.question.prior or bench.range_set(bench.shield.ranges)
     rng, points = np.random.default_rng(seed), [first]
     for _ in range(starts - 1):
         drawn, point = rng.random(len(first)), problem.values(first)
@@ -136,14 +135,14 @@ def search(problem: Problem, start: Floats, weights: Sequence[Floats], evaluatio
 
 
 def searched(problem: Problem, points: Sequence[Floats]) -> Fit:
-    """A local search from each point, with the weights of the first, and along gaps from the best end."""
+    """A local search from each point, with the weights of the first; then the gap unknowns from the best end."""
     weights = problem.weights(points[0])
     return with_gaps(Fit(problem, weights, tuple(search(problem, point, weights) for point in points)))
 
 
 def without_outliers(fit: Fit, points: Sequence[Floats]) -> Fit:
-    """The searches again without the samples that lie apart from their neighbours, as long as there are a few."""
-    for _ in range(LEFT_OUT):
+    """The searches repeated without outliers, until there are none or too many."""
+    for _ in range(REMOVALS):
         residuals = by_experiment(fit.problem.jacobian(fit.best.z, fit.weights)[0], fit.weights)
         found = [outliers(r, root > 0.0) for r, root in zip(residuals, fit.weights, strict=True)]
         if not few(found):
@@ -156,7 +155,7 @@ def without_outliers(fit: Fit, points: Sequence[Floats]) -> Fit:
 
 
 def outliers(residuals: Floats, counts: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mask of the samples of an experiment that lie apart from their neighbours, shape (n,).
+    """Mask of the outliers of an experiment, shape (n,).
 
     From residuals in standard deviations, and a mask of the outputs that count, shape (n, 2).
     """
@@ -174,21 +173,21 @@ def outliers(residuals: Floats, counts: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def few(found: Sequence[NDArray[np.bool_]]) -> bool:
-    """Returns True if there are outliers, and so few that they can be left out."""
+    """Returns True if there are outliers, and few enough to be removed."""
     count = sum(int(mask.sum()) for mask in found)
     return 0 < count <= max(1.0, MOST * sum(len(mask) for mask in found))
 
 
 def with_systematic_errors(fit: Fit, problem: Problem) -> Fit:
-    """The best minimum once more with the systematic errors of the ``problem``, which those of ``fit`` lack."""
+    """The best minimum searched again with the systematic errors of the ``problem``, which ``fit`` lacks."""
     problem = replace(problem, experiments=fit.problem.experiments)
-    if not problem.asked.along:
+    if not problem.question.default_nuisances:
         return Fit(problem, fit.weights, fit.ends)
     index = [problem.unknowns.index(unknown) for unknown in fit.problem.unknowns]
 
-    def wider(own: Floats) -> Floats:
+    def wider(ideal: Floats) -> Floats:
         z = problem.nominal()
-        z[index] = own
+        z[index] = ideal
         return z
 
     ends = tuple(replace(end, z=wider(end.z), start=wider(end.start)) for end in fit.ends)
@@ -196,18 +195,18 @@ def with_systematic_errors(fit: Fit, problem: Problem) -> Fit:
     return full.moved(full.best.then(search(problem, np.clip(full.best.z, *problem.bounds), fit.weights)))
 
 
-def along_filter(fit: Fit, point: Floats) -> Fit:
-    """One more search, from where a filter leads that follows the measured brake from a point."""
-    near = released(fit.problem, point)
+def with_continuation(fit: Fit, point: Floats) -> Fit:
+    """The fit with one more search, from the end of a continuation that begins at a point."""
+    near = continuation(fit.problem, point)
     return with_gaps(replace(fit, ends=(*fit.ends, near.then(search(fit.problem, near.z, fit.weights)))))
 
 
 def with_gaps(fit: Fit) -> Fit:
-    """The ends best first, the best one searched on along what happened in the gaps of the experiments.
+    """The ends best first, the best one refined together with the gap unknowns.
 
-    A search sees the gaps linearly around what the experiments hold of them. Here the simulation follows each step in
-    both, and none is taken that does not lower the sum of squares. The experiments hold then what was found in their
-    gaps.
+    The other searches linearise the gap unknowns at their values in the experiments. This one simulates each step in z
+    and the gap unknowns, and takes only steps that lower the sum of squares. The experiments then have the values
+    found.
     """
     problem, fit = fit.problem, replace(fit, ends=tuple(sorted(fit.ends, key=lambda end: end.cost)))
     if not any(experiment.gap_unknowns for experiment in problem.experiments):
@@ -223,7 +222,7 @@ def with_gaps(fit: Fit) -> Fit:
 
 
 def reweighted(fit: Fit, evaluations: int = EVALUATIONS) -> Fit:
-    """The best minimum with weights that follow the motion, where the clock jitters; else the same fit."""
+    """The best minimum with weights updated along the motion, with a jittering clock; else the same fit."""
     if fit.problem.plant.instruments.clock_jitter > 0.0:
         for _ in range(REWEIGHTED):
             weights = fit.problem.weights(fit.best.z)
@@ -241,10 +240,9 @@ def finished(
     validation: ModelValidation | None = None,
     **more: Any,
 ) -> Estimate:
-    """Estimate with all that follows from the fit ``z``: averaged values, information, covariance, validation.
+    """Estimate from a fit ``z``: averaged values, information, covariance, validation.
 
-    Residuals and derivatives ``linearised`` at a z are those of the simulation, if no others are given; ``more`` are
-    further fields.
+    ``linearised`` computes residuals and Jacobian at a z, by default of the simulation; ``more`` are further fields.
     """
     linearised = linearised or partial(problem.jacobian, weights=weights)
     found = linearised(z)
@@ -262,7 +260,7 @@ def finished(
         "samples": information - prior,
         "prior": prior if prior.any() else None,
         "sandwich": sandwich(information + added, jacobian, every, [len(r) for r in residuals], added),
-        "validation": validation or examine(problem, z, weights, found),
+        "validation": validation or validate(problem, z, weights, found),
         "ends": ends,
         "residuals": tuple(np.where(root > 0.0, r, np.nan) for r, root in zip(residuals, weights, strict=True)),
     }
@@ -272,12 +270,12 @@ def finished(
 def sandwich(
     information: Floats, jacobian: Floats, errors: Floats, lengths: Sequence[int], added: Floats | float = 0.0
 ) -> Floats:
-    """Covariance of an estimate from its own residuals: H⁻¹ (Σ g g^T) H⁻¹ with the scores g of samples, shape (p, p).
+    """Sandwich covariance of an estimate: H⁻¹ (Σ g g^T) H⁻¹ with the scores g of the samples, shape (p, p).
 
-    Scores of neighbouring samples count together (Newey and West 1987, Bartlett weights up to 4 (n/100)^(2/9) lags), so
-    that residuals that follow from each other widen it. What is no sample, a start or a prior, has its own information,
-    as has what is ``added`` to that of the jacobian. The residuals, shape (m,), are two for each sample of experiments
-    of these lengths, then those of what is no sample. The diagonal is inf for unknowns that the data do not identify.
+    Autocorrelated residuals widen it: scores are summed by Newey and West (1987), with Bartlett weights up to
+    4 (n/100)^(2/9) lags. Starts, priors and the information ``added`` to that of the Jacobian enter by their
+    information. ``errors``, shape (m,), has two residuals for each sample of experiments of these ``lengths``, then
+    those of starts and priors. The diagonal is inf for unknowns that the data do not identify.
     """
     scores, meat, used = jacobian * errors[:, None], np.zeros_like(information), 0
     for n in lengths:

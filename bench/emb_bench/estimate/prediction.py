@@ -33,7 +33,7 @@ from emb_bench.sim.open_loop import march, march_shares
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import LogError, UsageError
 
-NEAR_BOUND = 1e-6  # Share of what is searched within which an unknown is at its border
+NEAR_BOUND = 1e-6  # Share of the search range; nearer to its end an unknown is at the border
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,19 +46,19 @@ class Problem:
 
     bench: Bench
     plant: Plant
-    asked: EstimationProblem
+    question: EstimationProblem
     experiments: tuple[Experiment, ...]
 
     @property
     def window(self) -> float:
         """Length of the windows [s], of the method ``windows``."""
         machine = self.bench.machine
-        return self.asked.window or (WINDOW if machine is None else machine.window)
+        return self.question.window or (WINDOW if machine is None else machine.window)
 
     @cached_property
     def unknowns(self) -> tuple[Unknown, ...]:
         """The elements of z."""
-        return self.asked.unknowns(len(self.experiments))
+        return self.question.unknowns(len(self.experiments))
 
     @cached_property
     def _logarithmic(self) -> Booleans:
@@ -69,11 +69,11 @@ class Problem:
         return np.exp(z, out=z.copy(), where=self._logarithmic)
 
     def coordinates(self, values: Floats) -> Floats:
-        """The z of unknowns in SI units."""
+        """Z of unknowns in SI units."""
         return np.log(values, out=values.copy(), where=self._logarithmic)
 
     def scale(self, z: Floats) -> Floats:
-        """Changes of the unknowns in SI units with z."""
+        """Derivatives of the unknowns in SI units to z."""
         return np.where(self._logarithmic, self.values(z), 1.0)
 
     @cached_property
@@ -89,45 +89,45 @@ class Problem:
 
     @cached_property
     def prior(self) -> tuple[Floats, Floats]:
-        """Means of the unknowns before the experiments, and inverse deviations: zero for what nothing was known of."""
-        prior = self.asked.prior
+        """Prior means and inverse standard deviations of the unknowns; zero for a flat prior."""
+        prior = self.question.prior
         mean, inverse = np.zeros(len(self.unknowns)), np.zeros(len(self.unknowns))
         if prior is not None:
-            for name in self.asked.varied:
+            for name in self.question.varied:
                 i, low, high = self.unknowns.index(Unknown(name)), getattr(prior.low, name), getattr(prior.high, name)
                 mean[i], inverse[i] = 0.5 * (low + high), math.sqrt(information_of_range(low, high))
-        for name, (value, deviation) in self.asked.known.items():
+        for name, (value, deviation) in self.question.known.items():
             i = self.unknowns.index(Unknown(name))
             mean[i], inverse[i] = value, 1.0 / deviation
         for i, unknown in enumerate(self.unknowns):
-            if unknown.name in self.asked.systematic:
+            if unknown.name in self.question.systematic:
                 mean[i] = self.plant.instruments.encoder_offset if unknown.name == "offset" else 0.0
-                inverse[i] = 1.0 / self.asked.systematic[unknown.name]
+                inverse[i] = 1.0 / self.question.systematic[unknown.name]
         return mean, inverse
 
     def nominal(self) -> Floats:
-        """The z to begin with when nothing else is known: nominal, started where it was seen."""
+        """Initial z of a search: nominal parameters, and the measured start of each experiment."""
         offset = self.plant.instruments.encoder_offset
-        free = "offset" in self.asked.names
-        along = "offset" in self.asked.systematic
+        free = "offset" in self.question.names
+        estimated = "offset" in self.question.systematic
         of_all = self.plant.mechanics._asdict() | self.bench.brake._asdict()
         values = np.zeros(len(self.unknowns))
         for i, unknown in enumerate(self.unknowns):
             if unknown.experiment is None:
-                own, row = of_all.get(unknown.name, 0.0), PARAMETERS[unknown.name]
-                values[i] = row.start if unknown.name in FEATURES and own in (0.0, row.low) else own
+                value, row = of_all.get(unknown.name, 0.0), PARAMETERS[unknown.name]
+                values[i] = row.start if unknown.name in FEATURES and value in (0.0, row.low) else value
                 continue
             experiment = self.experiments[unknown.experiment]
             x1, x2 = experiment.start(experiment.angle if free else offset)
-            known = {"x1_0": 0.0 if free else x1, "x2_0": x2, "offset": offset if along else experiment.angle}
-            values[i] = known[unknown.name]
+            starts = {"x1_0": 0.0 if free else x1, "x2_0": x2, "offset": offset if estimated else experiment.angle}
+            values[i] = starts[unknown.name]
         return np.clip(self.coordinates(values), *self.bounds)
 
-    def started(self, known: Mapping[Unknown, float]) -> Floats:
-        """The z to begin with where some unknowns are known [SI units]."""
-        values = self.values(self.nominal()).tolist()
-        begun = [known.get(unknown, value) for unknown, value in zip(self.unknowns, values, strict=True)]
-        return np.clip(self.coordinates(np.array(begun)), *self.bounds)
+    def initial(self, values: Mapping[Unknown, float]) -> Floats:
+        """Initial z of a search with given values of some unknowns [SI units], the others nominal."""
+        nominal = self.values(self.nominal()).tolist()
+        merged = [values.get(unknown, value) for unknown, value in zip(self.unknowns, nominal, strict=True)]
+        return np.clip(self.coordinates(np.array(merged)), *self.bounds)
 
     def theta(self, z: Floats) -> BrakeParameters:
         """Parameters of the brake."""
@@ -151,27 +151,28 @@ class Problem:
         """The problem whose plant has the features of ``z``."""
         return replace(self, plant=replace(self.plant, mechanics=self.mechanics(z)))
 
-    def part(self, kept: Sequence[int]) -> tuple[Problem, list[int]]:
-        """The problem of some of the experiments, each as often as it is to count, and the elements of z it has."""
-        problem = replace(self, experiments=tuple(self.experiments[i] for i in kept))
-        own = [Unknown(u.name, None if u.experiment is None else kept[u.experiment]) for u in problem.unknowns]
-        return problem, [self.unknowns.index(unknown) for unknown in own]
+    def subset(self, index: Sequence[int]) -> tuple[Problem, list[int]]:
+        """Problem of the experiments ``index``, which may repeat, and the places of its unknowns in z."""
+        problem = replace(self, experiments=tuple(self.experiments[i] for i in index))
+        unknowns = [Unknown(u.name, None if u.experiment is None else index[u.experiment]) for u in problem.unknowns]
+        return problem, [self.unknowns.index(unknown) for unknown in unknowns]
 
     def columns(self, experiment: int) -> list[int]:
         """Indices of the elements of z that an experiment depends on."""
         return [i for i, u in enumerate(self.unknowns) if u.experiment in (None, experiment)]
 
     def at(self, z: Floats, experiment: int) -> Theta:
-        """Values at ``z`` of all that an experiment depends on."""
-        own = {self.unknowns[i].name: float(z[i]) for i in self.columns(experiment)}
-        offset = own.get("offset", self.plant.instruments.encoder_offset)
+        """Parameters, start and systematic errors of an experiment at ``z``."""
+        values = {self.unknowns[i].name: float(z[i]) for i in self.columns(experiment)}
+        offset = values.get("offset", self.plant.instruments.encoder_offset)
         x1, x2 = self.experiments[experiment].start(offset)
-        if "offset" in own:
-            x1 = 0.0  # with an unknown encoder offset the brake rests at the origin, unless its start is estimated too
+        if "offset" in values:
+            x1 = 0.0  # with an unknown offset the brake rests at the origin, unless the start is an unknown
         errors = SystematicErrors(
-            offset, own.get("current_offset", 0.0), own.get("delay", 0.0), own.get("velocity_gain", 0.0)
+            offset, values.get("current_offset", 0.0), values.get("delay", 0.0), values.get("velocity_gain", 0.0)
         )
-        return Theta(self.theta(z), (own.get("x1_0", x1), own.get("x2_0", x2)), errors, own.get("contact", 0.0))
+        start = values.get("x1_0", x1), values.get("x2_0", x2)
+        return Theta(self.theta(z), start, errors, values.get("contact", 0.0))
 
     def names(self, experiment: int) -> tuple[str, ...]:
         """The unknowns that an experiment depends on, in the order of ``columns``."""
@@ -182,10 +183,7 @@ class Problem:
         return self._simulated(z, experiment, self.mechanics(z), (*self.names(experiment), *besides))
 
     def motion(self, z: Floats, experiment: int, mechanics: Mechanics | None = None) -> Trajectory:
-        """Predicts an experiment without sensitivities to unknowns that are not its gaps'.
-
-        Another brake moves by ``mechanics``.
-        """
+        """Predicts an experiment with sensitivities to its gap unknowns only, optionally with other ``mechanics``."""
         return self._simulated(z, experiment, self.mechanics(z) if mechanics is None else mechanics, ())
 
     def parts(self, z: Floats, experiment: int, unknowns: Integers, shares: Floats) -> Floats:
@@ -197,15 +195,15 @@ class Problem:
         plant, t_s = replace(self.plant, mechanics=mechanics), self.bench.timing.sample_time
         return simulate(plant, self.at(z, experiment), self.experiments[experiment], t_s, names, compiled(march))
 
-    def weights(self, z: Floats, said: Sequence[Trajectory] | None = None) -> list[Floats]:
+    def weights(self, z: Floats, trajectories: Sequence[Trajectory] | None = None) -> list[Floats]:
         """Inverse standard deviations of each experiment's samples at ``z``, 0 where they do not count, shape (n, 2).
 
-        What is predicted there may have been ``said`` before.
+        ``trajectories``: predictions at ``z``, if they have been computed.
         """
         result = []
         for i, experiment in enumerate(self.experiments):
             instruments = self.plant.instruments
-            states = (self.motion(z, i) if said is None else said[i]).states
+            states = (self.motion(z, i) if trajectories is None else trajectories[i]).states
             along = weights_along(self.bench, "physical", instruments, states)
             root = np.sqrt(along) * experiment.measured[:, None]
             root[later(experiment.inside.astype(np.float64), instruments.measurement_delay) > 0.0] = 0.0
@@ -213,31 +211,31 @@ class Problem:
         return result
 
     def jacobian(
-        self, z: Floats, weights: Sequence[Floats], said: Sequence[Trajectory] | None = None
+        self, z: Floats, weights: Sequence[Floats], trajectories: Sequence[Trajectory] | None = None
     ) -> tuple[Floats, Floats]:
-        """Residuals measured − shown in standard deviations and their derivatives to z, without what gaps explain.
+        """Residuals measured − predicted in standard deviations and their Jacobian, gap unknowns projected out.
 
-        Of a single period without report the current is unknown, Gaussian around the one that is assumed and as wide as
-        the bench's limit; of several in a row, angle and velocity after them, next to free. Both enter the residuals
-        linearly around what the experiments hold. What is left beside them has J^T J as the information on z with them
-        unknown, and |r|² as the least sum of squares over them.
+        A single period without report has an unknown current, Gaussian around the assumed one with the bench's limit as
+        standard deviation. Several such periods in a row have unknown angle and velocity at their end, with a prior
+        next to flat. Both are linearised at the values in the experiments. After the projection J^T J is the
+        information on z with the gap unknowns marginalised, and |r|² the least sum of squares over them.
 
         Returns:
             Shapes (m,) and (m, len(z)): all samples of all experiments, angle and velocity in turn, then each
             experiment's start if that is unknown, then the prior, then the unknowns of the gaps.
         """
-        residuals, rows = self.joint(z, weights, said)
-        own, basis = rows[:, : len(z)], _orthonormal(rows[:, len(z) :])
-        return residuals - basis @ (basis.T @ residuals), own - basis @ (basis.T @ own)
+        residuals, rows = self.joint(z, weights, trajectories)
+        jacobian, basis = rows[:, : len(z)], _orthonormal(rows[:, len(z) :])
+        return residuals - basis @ (basis.T @ residuals), jacobian - basis @ (basis.T @ jacobian)
 
     def gap_basis(self, z: Floats, weights: Sequence[Floats]) -> Floats:
         """Orthonormal basis of the residuals that the unknowns of the gaps can explain, shape (m, gaps)."""
         return _orthonormal(self.joint(z, weights)[1][:, len(z) :])
 
     def joint(
-        self, z: Floats, weights: Sequence[Floats], said: Sequence[Trajectory] | None = None
+        self, z: Floats, weights: Sequence[Floats], trajectories: Sequence[Trajectory] | None = None
     ) -> tuple[Floats, Floats]:
-        """Residuals as in :meth:`jacobian`, with the unknowns of the gaps where the experiments hold them.
+        """Residuals as in :meth:`jacobian`, with the gap unknowns at their values in the experiments.
 
         Returns:
             Shapes (m,) and (m, len(z) + gaps): derivatives to z, and to the unknowns of the gaps, experiment by
@@ -245,7 +243,7 @@ class Problem:
         """
         parts, columns = [], []
         for i, (experiment, root) in enumerate(zip(self.experiments, weights, strict=True)):
-            at = self.predict(z, i) if said is None else said[i]
+            at = self.predict(z, i) if trajectories is None else trajectories[i]
             rows = at.sensitivities * root[:, None]
             parts.append((np.nan_to_num(experiment.samples - at.samples) * root, rows[:, : len(self.columns(i))]))
             in_gaps = rows[:, rows.shape[1] - experiment.gap_unknowns :]
@@ -254,20 +252,20 @@ class Problem:
         count = sum(experiment.gap_unknowns for experiment in self.experiments)
         if not count:
             return residuals, rows
-        held, assumed, inverse = (
+        current, assumed, inverse = (
             np.concatenate(part) for part in zip(*map(self._gaps, range(len(parts))), strict=True)
         )
-        known = np.zeros((len(residuals) - sum(len(block) for block in columns), count))
-        own = -np.concatenate([block_diag(*columns), known, np.diag(inverse)])
+        no_samples = np.zeros((len(residuals) - sum(len(block) for block in columns), count))
+        of_gaps = -np.concatenate([block_diag(*columns), no_samples, np.diag(inverse)])
         rows = np.concatenate([rows, np.zeros((count, len(z)))])
-        return np.concatenate([residuals, (assumed - held) * inverse]), np.concatenate([rows, own], axis=1)
+        return np.concatenate([residuals, (assumed - current) * inverse]), np.concatenate([rows, of_gaps], axis=1)
 
     def in_gaps(self) -> Floats:
         """Values in the gaps of the experiments: currents [A], then angles [rad] and velocities [rad/s] in turn."""
         return np.concatenate([self._gaps(i)[0] for i in range(len(self.experiments))])
 
     def _gaps(self, experiment: int) -> tuple[Floats, Floats, Floats]:
-        """Values that an experiment holds in its gaps, means before the samples, and inverse deviations."""
+        """Gap unknowns of an experiment: values, prior means and inverse prior deviations."""
         data = self.experiments[experiment]
         pulses, breaks = data.gaps
         places = gap_ends(data, self.plant.instruments)[1].ravel()
@@ -282,13 +280,12 @@ class Problem:
         )
 
     def filled(self, gaps: Floats) -> Problem:
-        """The problem whose experiments hold these unknowns in their gaps, in the order of :meth:`in_gaps`."""
-        left, experiments = gaps, []
-        for experiment in self.experiments:
-            own, left = left[: experiment.gap_unknowns], left[experiment.gap_unknowns :]
+        """The problem with these gap unknowns in its experiments, in the order of :meth:`in_gaps`."""
+        ends, experiments = np.cumsum([experiment.gap_unknowns for experiment in self.experiments]), []
+        for experiment, values in zip(self.experiments, np.split(gaps, ends[:-1]), strict=True):
             pulses, currents = experiment.gaps[0], experiment.currents.copy()
-            currents[pulses] = own[: len(pulses)]
-            places = own[len(pulses) :].reshape(-1, 2)
+            currents[pulses] = values[: len(pulses)]
+            places = values[len(pulses) :].reshape(-1, 2)
             experiments.append(
                 replace(experiment, currents=currents, places=places) if experiment.gap_unknowns else experiment
             )
@@ -297,8 +294,8 @@ class Problem:
     def stacked(self, z: Floats, parts: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
         """All residuals in one row, and their derivatives to z, as :meth:`jacobian`.
 
-        The ``parts`` are of each experiment the errors of its samples in standard deviations, shape (n, 2), and what
-        each of its unknowns adds to what is shown, in the same unit, shape (n, own, 2).
+        ``parts`` has for each experiment the whitened errors of its samples, shape (n, 2), and the derivatives of the
+        prediction to the experiment's unknowns in the same unit, shape (n, columns, 2).
         """
         residuals, rows = [], []
         for i, (errors, shares) in enumerate(parts):
@@ -307,8 +304,8 @@ class Problem:
             block[:, :, columns] = -shares.transpose(0, 2, 1)
             residuals.append(errors.ravel())
             rows.append(block.reshape(-1, len(z)))
-        known, their_rows = self.prior_residuals(z)
-        return np.concatenate([*residuals, known]), np.concatenate([*rows, their_rows])
+        of_priors, rows_of_priors = self.prior_residuals(z)
+        return np.concatenate([*residuals, of_priors]), np.concatenate([*rows, rows_of_priors])
 
     def rests(self) -> dict[int, list[int]]:
         """Numbers of the experiments whose angle at rest is a measurement, and the elements of z that it depends on."""
@@ -320,20 +317,20 @@ class Problem:
         return found
 
     def prior_residuals(self, z: Floats) -> tuple[Floats, Floats]:
-        """Residuals of what is no sample, and their derivatives: an experiment's start if it is unknown, the prior."""
+        """Residuals of unknown starts and of the priors, and their derivatives to z."""
         residuals, rows = [], []
         for i, touched in self.rests().items():
             experiment, row = self.experiments[i], np.zeros((1, len(z)))
             row[0, touched] = -1.0 / experiment.slack
             free = any(self.unknowns[c].name == "offset" for c in touched)
-            unseen = 0.0 if free else self.plant.instruments.encoder_offset
-            shown = sum(float(z[c]) for c in touched) + unseen
-            residuals.append(np.array([(experiment.angle - shown) / experiment.slack]))
+            fixed = 0.0 if free else self.plant.instruments.encoder_offset
+            predicted = sum(float(z[c]) for c in touched) + fixed
+            residuals.append(np.array([(experiment.angle - predicted) / experiment.slack]))
             rows.append(row)
         mean, inverse = self.prior
-        known = np.flatnonzero(inverse)
-        residuals.append((mean - self.values(z))[known] * inverse[known])
-        rows.append(-np.diag(inverse * self.scale(z))[known])
+        index = np.flatnonzero(inverse)
+        residuals.append((mean - self.values(z))[index] * inverse[index])
+        rows.append(-np.diag(inverse * self.scale(z))[index])
         return np.concatenate(residuals), np.concatenate(rows)
 
 
@@ -348,21 +345,21 @@ def by_experiment(errors: Floats, weights: Sequence[Floats]) -> list[Floats]:
     return [part.reshape(root.shape) for part, root in zip(np.split(errors, ends), weights, strict=False)]
 
 
-def make_problem(bench: Bench, plant: Plant, experiments: Sequence[Experiment], asked: EstimationProblem) -> Problem:
-    """Makes the problem to be solved, and checks that it can be."""
-    check_model(plant, asked.names)
+def make_problem(bench: Bench, plant: Plant, experiments: Sequence[Experiment], question: EstimationProblem) -> Problem:
+    """The problem, once its model has the unknowns and there are enough samples."""
+    check_model(plant, question.names)
     if not experiments:
         raise UsageError("expected at least one record")
-    if why_not := too_few(plant, asked, sum(int(r.measured.sum()) for r in experiments), len(experiments)):
+    if why_not := too_few(plant, question, sum(int(r.measured.sum()) for r in experiments), len(experiments)):
         raise LogError(f"{', '.join(experiment.name for experiment in experiments)}: {why_not}")
-    return Problem(bench, plant, asked, tuple(experiments))
+    return Problem(bench, plant, question, tuple(experiments))
 
 
-def too_few(plant: Plant, asked: EstimationProblem, samples: int, experiments: int) -> str:
-    """The reason that so many samples cannot tell the unknowns, of all experiments together; empty if they can."""
-    unknowns, outputs = len(asked.unknowns(experiments)), 1 if plant.instruments.observer_bandwidth > 0.0 else 2
+def too_few(plant: Plant, question: EstimationProblem, samples: int, experiments: int) -> str:
+    """Reason that there are too few samples for the unknowns of all experiments; empty if there are enough."""
+    unknowns, outputs = len(question.unknowns(experiments)), 1 if plant.instruments.observer_bandwidth > 0.0 else 2
     if samples * outputs >= unknowns:
         return ""
-    asked_for = len(replace(asked, systematic={}).unknowns(experiments))
-    also = f" and {unknowns - asked_for} systematic errors" if unknowns > asked_for else ""
-    return f"{'1 sample is' if samples == 1 else f'{samples} samples are'} too few for {asked_for} unknowns{also}"
+    requested = len(replace(question, systematic={}).unknowns(experiments))
+    also = f" and {unknowns - requested} systematic errors" if unknowns > requested else ""
+    return f"{'1 sample is' if samples == 1 else f'{samples} samples are'} too few for {requested} unknowns{also}"

@@ -1,14 +1,14 @@
 """Prediction-error method: the parameters with the smallest innovations, each sample given those before it.
 
-Output error takes the brake to move as the model says and nothing else; what disturbs it then is in all later samples,
-and biases the parameters. Here the brake is followed by a Kalman filter (:mod:`emb_bench.estimate.innovations`), and
-what is to be small are its innovations (Ljung, System Identification, 2nd ed., chapter 7). How much the brake is
-disturbed is chosen by maximum restricted likelihood; where nothing disturbs it, this is output error.
+Output error assumes that no disturbance acts on the brake; a disturbance changes all later samples and biases the
+parameters. This method minimises the innovations of a Kalman filter (:mod:`emb_bench.estimate.innovations`; Ljung,
+System Identification, 2nd ed., chapter 7). The process noise is estimated by maximum restricted likelihood; without
+process noise the method is output error.
 
-For a given disturbance the innovations are minimised with the gains held (:func:`emb_bench.estimate.search.converge`);
-their information is that of the innovations with the gains held, too. That the disturbance is itself an estimate is
-left out of it; intervals still cover (``benchmarks/interval_coverage.py --case disturbance``). Every search begins
-under a strong disturbance, where there are few local minima, and takes what it found there to the likely one.
+For a given process noise the innovations are minimised with fixed gains (:func:`emb_bench.estimate.search.converge`),
+and the information is theirs with fixed gains. It neglects that the process noise is an estimate; intervals still cover
+(``benchmarks/interval_coverage.py --case disturbance``). Every search begins with strong process noise, where there are
+few local minima, and continues from there with the likeliest.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from scipy.optimize import minimize_scalar
 
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.estimate import Estimate
-from emb_bench.estimate.innovations import Filter, Followed
+from emb_bench.estimate.innovations import Filter, FilterPrediction
 from emb_bench.estimate.method import Method
-from emb_bench.estimate.model_validation import examine
+from emb_bench.estimate.model_validation import validate
 from emb_bench.estimate.output_error import finished, start_points
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Disturbance
@@ -33,24 +33,24 @@ from emb_bench.estimate.search import converge, strong
 from emb_bench.information.fisher import information_of_range
 
 POWERS = {"walk": range(2, -7, -1), "load": range(0, -5, -1)}
-"""Powers of ten of the walks that are tried, in their units: weaker ones are lost in the noise."""
-BOTH = 6.6  # Deviance that a second kind of disturbance has to take away: by chance less in 199 of 200 cases
-_NOTHING = 1e-3  # of a deviance: what is left of searches that end
+"""Powers of ten of the walks on the grid, in their units; weaker ones are below the noise."""
+BOTH = 6.6  # Fall of the deviance that justifies a second kind of disturbance: by chance less in 199 of 200 cases
+_NOTHING = 1e-3  # of a deviance: the error of a converged search
 
 
 class PredictionError(Method):
-    """The smallest innovations, and how much the brake was disturbed."""
+    """The smallest innovations, and the likeliest process noise."""
 
     systematic = True
 
     def solve(self, problem: Problem) -> Estimate:
         """As :class:`Method`."""
         points = start_points(problem, self.starts, self.seed)
-        followed = [converge(Filter(problem, strong(problem)), point) for point in points]
-        first = int(np.argmin([end.cost for end in followed]))
-        found, near, ratio = likely(problem, followed[first].z)
+        begun = [converge(Filter(problem, strong(problem)), point) for point in points]
+        first = int(np.argmin([end.cost for end in begun]))
+        found, near, ratio = likely(problem, begun[first].z)
         ends = []
-        for i, before in enumerate(followed):
+        for i, before in enumerate(begun):
             end = converge(found, near if i == first else before.z)
             deviance = found.deviance(end.z, problem.weights(end.z))
             ends.append(replace(before.then(end), cost=deviance))
@@ -59,8 +59,9 @@ class PredictionError(Method):
         weights = problem.weights(best)
         gains = found.gains(best, weights)
         innovations = found.jacobian(best, weights, gains)
-        disturbance, shown = Disturbance(found.walk, found.load, ratio), Followed(found, best, weights, gains)
-        validation = examine(problem, best, weights, innovations, disturbance, shown)
+        disturbance = Disturbance(found.walk, found.load, ratio)
+        prediction = FilterPrediction(found, best, weights, gains)
+        validation = validate(problem, best, weights, innovations, disturbance, prediction)
         return finished(
             problem,
             best,
@@ -75,15 +76,15 @@ class PredictionError(Method):
 
 
 def likely(problem: Problem, near: Floats) -> tuple[Filter, Floats, float]:
-    """The disturbance of the greatest restricted likelihood, z under it, and the deviance that it takes away.
+    """The filter of the greatest restricted likelihood, its z, and its fall of the deviance against no disturbance.
 
-    A walk of the velocity, or one of the load; both where that takes away more of the deviance than chance would.
+    A walk of the velocity, or of the load; both only if the deviance falls by more than by chance.
     """
     none, kinds = Filter(problem, 0.0), tuple(POWERS)
     places = [_refined(none, kind, _roughly(none, kind, near)) for kind in kinds]
     first = int(np.argmin([place.deviance for place in places]))
     best = places[first]
-    still, undisturbed = _least(none, best.z)
+    z, undisturbed = _least(none, best.z)
     if undisturbed - best.deviance > BOTH:
         other = kinds[1 - first]
         second = _roughly(best.filter, other, best.z)
@@ -91,7 +92,7 @@ def likely(problem: Problem, near: Floats) -> tuple[Filter, Floats, float]:
             second = _refined(best.filter, other, second)
             best = _refined(second.filter, kinds[first], second)
     gained = undisturbed - best.deviance
-    return (best.filter, best.z, gained) if gained > _NOTHING else (none, still, 0.0)
+    return (best.filter, best.z, gained) if gained > _NOTHING else (none, z, 0.0)
 
 
 class _Place(NamedTuple):
@@ -130,11 +131,11 @@ def _refined(base: Filter, kind: str, rough: _Place) -> _Place:
 
 
 def _least(found: Filter, start: Floats) -> tuple[Floats, float]:
-    """The best of the other unknowns under a disturbance, and the restricted deviance there.
+    """The best z under a disturbance, and the restricted deviance there.
 
-    What a disturbance does most looks much like other parameters, and the fit has taken it up. So the likelihood is
-    that with the unknowns integrated out, flat within their bounds, as if it were Gaussian in them (Patterson and
-    Thompson, Recovery of inter-block information when block sizes are unequal, Biometrika 58, 1971).
+    Other parameters absorb most of a disturbance's effect. So the likelihood is that with the unknowns integrated out,
+    with a flat prior within their bounds and in Gaussian approximation (Patterson and Thompson, Recovery of inter-block
+    information when block sizes are unequal, Biometrika 58, 1971).
     """
     problem = found.problem
     z = converge(found, start).z

@@ -1,4 +1,4 @@
-"""The problem that is put to an estimator, and records of its tests."""
+"""Problem of an estimator, and records of its tests."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from emb_runtime.estimator import estimate
 
 SYSTEMATIC = SystematicErrors._fields
 """Systematic errors that are estimated too by default, each with the prior of the bench file."""
-FREE = 0.05  # Standard deviation of J, as a share of it, where a parameter tells it that is known beforehand
+FREE = 0.05  # Standard deviation of J, relative, where a measured parameter determines it
 FACTOR = 10.0  # Brakes beyond nominal by this factor are not searched
 METHODS: Mapping[str, str] = {
     "oem": "output error",
@@ -28,9 +28,9 @@ METHODS: Mapping[str, str] = {
 """Estimation methods by their names."""
 WITHOUT_GAPS = ("windows",)  # Methods that assume the currents of periods without a report
 OUTPUTS = ("angle", "velocity")
-FEWEST_WINDOWS = 3  # For each unknown that they share: with fewer their scatter says little
-SAME = 1.0  # Searches whose weighted sums of squares differ by less ended in the same minimum: a shift of one sigma
-OUTLIER = 8.0  # Distance from the neighbours from which on a sample is an outlier, in standard deviations
+FEWEST_WINDOWS = 3  # For each shared unknown; fewer give no usable covariance
+SAME = 1.0  # Difference of χ² below which two searches ended in the same minimum: a shift of one sigma
+OUTLIER = 8.0  # Distance from the neighbours beyond which a sample is an outlier [standard deviations]
 STARTS = 8  # Default number of local searches
 DONE = "DONE"  # Exit reason of a run that came to its planned end
 NORMAL_95 = estimate.NORMAL_95  # Standard deviations that 95 % of a Gaussian lie within
@@ -50,33 +50,33 @@ class Unknown(NamedTuple):
 
 @dataclass(frozen=True)
 class EstimationProblem(Question):
-    """Parameters to be estimated; a prior is taken as a Gaussian of the same mean and variance."""
+    """Parameters to be estimated; a prior becomes a Gaussian of the same mean and variance."""
 
     systematic: Mapping[str, float] = field(default_factory=dict)
     """Systematic errors that are estimated too: standard deviation of the prior, by name; inf without a prior."""
-    allowed: Mapping[str, float] = field(default_factory=dict)
-    """Effects that are not estimated and that the total allows for: standard deviation of the prior, by name."""
+    unmodelled: Mapping[str, float] = field(default_factory=dict)
+    """Effects that are not estimated and widen the total: standard deviation of the prior, by name."""
     known: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Value and standard deviation of parameters that are known beforehand, SI units, by name."""
+    """Gaussian priors of parameters measured otherwise: mean and standard deviation [SI units], by name."""
     window: float = 0.0
-    """Length of the windows of the method ``windows`` [s]; 0 for what the bench says."""
+    """Length of the windows of the method ``windows`` [s]; 0 for the bench's default."""
 
     @property
-    def along(self) -> tuple[str, ...]:
-        """Unknowns that are estimated too without being asked for; with the encoder's offset, the true start."""
+    def default_nuisances(self) -> tuple[str, ...]:
+        """Nuisance parameters added by default: the systematic errors; the encoder's offset adds the start x1_0."""
         named = dict.fromkeys(("x1_0", *self.systematic) if "offset" in self.systematic else self.systematic)
         return tuple(name for name in named if name not in self.names)
 
     def unknowns(self, count: int) -> tuple[Unknown, ...]:
-        """The numbers to be estimated from ``count`` experiments: ``names`` in their order, then what is ``along``."""
+        """The numbers to be estimated from ``count`` experiments: ``names``, then ``default_nuisances``."""
         found: list[Unknown] = []
-        for name in (*self.names, *self.along):
+        for name in (*self.names, *self.default_nuisances):
             found += [Unknown(name, i) for i in range(count)] if name in OF_AN_EXPERIMENT else [Unknown(name)]
         return tuple(found)
 
 
 def searched(bench: Bench, unknown: Unknown) -> tuple[float, float]:
-    """Search range of an unknown: lowest and highest value in SI units. No curvature alone lets the clamp pull."""
+    """Search range of an unknown [SI units]. A negative curvature alone must not make the clamping force negative."""
     row, limits = PARAMETERS[unknown.name], bench.limits
     if unknown.name in CURVED:
         return -(max(map(abs, limits.angle)) ** -CURVED[unknown.name]), row.high
@@ -92,17 +92,17 @@ def searched(bench: Bench, unknown: Unknown) -> tuple[float, float]:
 
 
 def has_time_for_a_delay(plant: Plant) -> bool:
-    """True if there is time between samples in which a command may be late, and no lag that looks like it."""
+    """True if the solver has time between samples for a delay, and no current lag that acts like one."""
     return plant.mechanics.solver == EXACT and plant.mechanics.current_lag == 0.0
 
 
-def freed(asked: EstimationProblem, bench: Bench) -> EstimationProblem:
-    """The problem with J unknown too, where a parameter is known that tells it; else the same."""
-    if not asked.known or "J" in asked.names:
-        return asked
+def freed(question: EstimationProblem, bench: Bench) -> EstimationProblem:
+    """The problem with J as a further unknown, if a measured parameter determines it; else the same."""
+    if not question.known or "J" in question.names:
+        return question
     inertia = bench.brake.J
-    known = {**asked.known, "J": (inertia, max(FREE, bench.systematic.inertia) * inertia)}
-    return replace(asked, nuisances=(*asked.nuisances, "J"), known=known)
+    priors = {**question.known, "J": (inertia, max(FREE, bench.systematic.inertia) * inertia)}
+    return replace(question, nuisances=(*question.nuisances, "J"), known=priors)
 
 
 def check_model(plant: Plant, names: Sequence[str]) -> None:
@@ -156,13 +156,13 @@ class End:
     evaluations: int
 
     def then(self, after: End) -> End:
-        """The end of a search that went on from this one."""
+        """The end of a search that was continued from this one."""
         return replace(after, start=self.start, evaluations=self.evaluations + after.evaluations)
 
 
 @dataclass(frozen=True)
 class Whiteness:
-    """Whiteness test: residuals of one output must not follow from each other (Ljung and Box 1978)."""
+    """Whiteness test: autocorrelation of one output's residuals (Ljung and Box 1978)."""
 
     statistic: float
     lags: int
@@ -171,9 +171,9 @@ class Whiteness:
 
 @dataclass(frozen=True)
 class Independence:
-    """Independence test: residuals of one output must not follow from the currents."""
+    """Independence test: correlation of one output's residuals with past currents."""
 
-    statistic: float  # F, of the share that the currents of the last periods explain
+    statistic: float  # F, of the part that the last currents explain
     p_value: float
     correlation: float  # Largest of the correlations with the current, of either sign
     lag: int  # At this many samples
@@ -183,48 +183,47 @@ class Derived(NamedTuple):
     """Observer that derives the velocity from the angle."""
 
     bandwidth: float  # [rad/s]
-    least: float  # Least bandwidth that is not told apart from it [rad/s]
-    is_known: bool  # False if it may be much larger
+    least: float  # Least bandwidth that fits as well [rad/s]
+    is_known: bool  # False if much larger ones fit as well
     p_value: float  # Chance of such a lag in a velocity that is measured
 
 
 @dataclass(frozen=True)
 class Suspect:
-    """An effect that the model lacks, and how much of it the residuals ask for (Rao's score test)."""
+    """An effect that the model lacks, and its amount by Rao's score test."""
 
     name: str
     value: float  # First-order estimate, in the unknown's unit; relative for a parameter
     sigmas: float
     p_value: float = 1.0  # Chance of as much of it if the model is right
-    possible: bool = True  # A brake can have this amount
-    observer: Derived | None = None  # What the velocity's lag comes from, if the experiment shows it
-    fall: float = 0.0  # Of χ² with it, to first order; of a term of the clamping force's curve with both terms
+    possible: bool = True  # The amount is physically possible
+    observer: Derived | None = None  # Observer behind a lag of the velocity, if the experiment shows one
+    fall: float = 0.0  # Of χ², to first order; a term of the clamping force's curve counts with the other term
 
 
 class Cause(NamedTuple):
-    """The effect that is most probably why the model does not fit."""
+    """The most probable reason that the model does not fit."""
 
     suspect: Suspect
-    sigmas: float  # Of its score; of a curve with both terms
+    sigmas: float  # Of the score; of a curve, with both terms
     share: float | None
-    """Part of the misfit that it takes, to first order: 1 where none is left, None where the residuals' size is no
-    alarm."""
+    """Share of the misfit that it explains, to first order: 1 if it explains all of it, None if χ² is no alarm."""
     is_curve: bool  # With the other term of the clamping force's curve
-    possible: bool  # The brake can have it, as far as its amount can tell
+    possible: bool  # Its amount is physically possible, as far as that can be judged
 
 
 @dataclass(frozen=True)
 class JointScore:
     """Score test of all suspects together."""
 
-    statistic: float  # χ² of the residuals in the space of the effects
+    statistic: float  # χ² of the residuals projected on the effects
     rank: int
     p_value: float
 
 
 @dataclass(frozen=True)
 class Contribution:
-    """Entry of the uncertainty budget: an effect that is not estimated."""
+    """Entry of the uncertainty budget: one unmodelled effect."""
 
     name: str
     bias: tuple[float, ...]
@@ -234,7 +233,7 @@ class Contribution:
 
 
 class Disturbance(NamedTuple):
-    """Disturbance that an estimator found in order to whiten the residuals."""
+    """Process noise that an estimator found to whiten the residuals."""
 
     walk: float  # Standard deviation of the velocity's random walk [rad/s per √s]
     load: float  # Standard deviation of the load's random walk, as a current [A per √s]
@@ -242,7 +241,7 @@ class Disturbance(NamedTuple):
 
     @property
     def p_value(self) -> float:
-        """Probability of such a ratio without a disturbance: half of the time it is zero then (Chernoff 1954)."""
+        """Probability of such a ratio without a disturbance, when it is zero half of the time (Chernoff 1954)."""
         from scipy import special
 
         return 0.5 * float(special.chdtrc(1, self.ratio)) if self.ratio > 0.0 else 1.0
@@ -250,16 +249,16 @@ class Disturbance(NamedTuple):
 
 @dataclass(frozen=True)
 class ModelValidation:
-    """Model validation: tests on the residuals of whether the model explains the experiments."""
+    """Residual tests of the model."""
 
     chi2: float
     freedom: int  # Samples of both outputs less unknowns
-    expected: tuple[float, float]  # χ²/n of the right model lies between these, but for one time in a hundred
+    expected: tuple[float, float]  # χ²/n of a right model lies between these in 99 of 100 cases
     chi2_p: float
     whiteness: Mapping[str, Whiteness]  # By output
     independence: Mapping[str, Independence]  # By output
-    suspects: tuple[Suspect, ...]  # Most suspicious first
-    budget: tuple[Contribution, ...]  # Effects that the total allows for
+    suspects: tuple[Suspect, ...]  # Most significant first
+    budget: tuple[Contribution, ...]  # Unmodelled effects
     together: JointScore | None  # None without a suspect
     alarming: frozenset[str] = frozenset()
     """Tests that reject the model: ``size``, ``scores``, and ``current of``, ``whiteness of``, ``score of`` a name."""

@@ -1,11 +1,11 @@
-"""Local searches for the least sum of squares, and how they keep out of local minima.
+"""Local searches for the least sum of squares, and the continuation that avoids local minima.
 
 The method is a trust region within bounds (Branch, Coleman and Li 1999, as in ``scipy.optimize.least_squares``).
 
-**Following.** A simulated brake that turns a little too early drifts away from the measured one, and from there on the
-residuals hold little information on the parameters: a local minimum. A filter that trusts the samples never lets the
-brake get far from the measured one, and has few. It is the simulation again when its trust is taken away;
-:func:`released` does that step by step.
+**Continuation.** A simulated brake that reverses a little too early diverges from the measured one, and later residuals
+have little information on the parameters: a local minimum. A Kalman filter with process noise stays near the measured
+brake and has few local minima. As the process noise goes to zero, the filter becomes the simulation;
+:func:`continuation` lowers it step by step.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import End
 
-EVALUATIONS = 100  # Most simulations of one local search; most end after ten
-ROUNDS = 8  # Most times that the gains of a filter are recomputed in one search; two are the rule
-STAYS = 0.02  # Standard deviations by which an estimate moves between rounds, at most, when it is at its end
-HUGE = 1e100  # Residual that is as bad as any: a filter whose gains are held can diverge at a trial step
-RELEASE = (1.0, 0.1, 0.01, 0.0)  # Disturbances, in :func:`strong`, by which a filter becomes the simulation
+EVALUATIONS = 100  # Limit of one local search; most need ten
+ROUNDS = 8  # Limit of the updates of a filter's gains in one search; most need two
+CONVERGED = 0.02  # Move of an estimate between rounds at the end of a search [standard deviations]
+HUGE = 1e100  # Largest residual: a filter with fixed gains can diverge at a trial step
+CONTINUATION = (1.0, 0.1, 0.01, 0.0)  # Process noise of the continuation, in units of :func:`strong`
 
 
 def minimise(
@@ -39,14 +39,13 @@ def minimise(
 ) -> End:
     """One local search for the least sum of squares within the bounds.
 
-    What follows the unknowns of the problem in ``start`` is searched along without bounds, and is in the end too.
-    ``residuals`` gives those of a z with their derivatives. Features are moved by their values, for none at all is
-    infinitely far in a logarithm.
+    ``residuals`` computes residuals and Jacobian at a z. Elements of ``start`` after the unknowns of the problem have
+    no bounds. Features are searched linearly: zero is infinitely far in a logarithm.
     """
     added = np.zeros(len(start) - len(problem.unknowns))
     linear = np.append([u.name in FEATURES for u in problem.unknowns], added).astype(np.bool_)
     unit = np.append(problem.coordinates(np.array([PARAMETERS[u.name].start or 1.0 for u in problem.unknowns])), added)
-    known: dict[bytes, tuple[Floats, Floats]] = {}
+    cache: dict[bytes, tuple[Floats, Floats]] = {}
     low, high = (np.append(z, added + side) for z, side in zip(problem.bounds, (-math.inf, math.inf), strict=True))
 
     def moved(z: Floats) -> Floats:
@@ -57,11 +56,11 @@ def minimise(
 
     def both(x: Floats) -> tuple[Floats, Floats]:
         key = x.tobytes()
-        if key not in known:
-            known.clear()  # the derivatives are evaluated at the newest point only
+        if key not in cache:
+            cache.clear()  # the derivatives are evaluated at the newest point only
             errors, derivatives = residuals(of(x))
-            known[key] = np.clip(errors, -HUGE, HUGE), derivatives / np.where(linear, x, 1.0)
-        return known[key]
+            cache[key] = np.clip(errors, -HUGE, HUGE), derivatives / np.where(linear, x, 1.0)
+        return cache[key]
 
     found = least_squares(
         lambda x: both(x)[0],
@@ -79,9 +78,9 @@ def minimise(
 
 
 def strong(problem: Problem, kind: str = "walk") -> float:
-    """The random walk that moves the velocity by the bench's noise in a period, by the field of a :class:`Filter`.
+    """Random walk that changes the velocity by its noise in one period, for a field of :class:`Filter`.
 
-    That of the velocity itself [rad/s per √s], or of a ``load`` [A per √s].
+    Of the velocity, ``walk`` [rad/s per √s], or of the ``load`` [A per √s].
     """
     brake, noise, t_s = problem.bench.brake, problem.bench.noise.velocity, problem.bench.timing.sample_time
     if kind == "walk":
@@ -100,14 +99,14 @@ def converge(found: Filter, start: Floats) -> End:
         evaluations += end.evaluations
         moved = float(np.linalg.norm(jacobian @ (end.z - z)))
         z = end.z
-        if moved < STAYS or (found.walk == found.load == 0.0 and problem.plant.instruments.clock_jitter == 0.0):
+        if moved < CONVERGED or (found.walk == found.load == 0.0 and problem.plant.instruments.clock_jitter == 0.0):
             break
     return replace(end, start=start, evaluations=evaluations)
 
 
-def released(problem: Problem, start: Floats) -> End:
-    """Minimum that a filter leads to which follows the measured brake at first, and is the simulation in the end."""
-    end = converge(Filter(problem, RELEASE[0] * strong(problem)), start)
-    for share in RELEASE[1:]:
+def continuation(problem: Problem, start: Floats) -> End:
+    """Minimum by continuation: process noise of a filter from strong to zero, where the filter is the simulation."""
+    end = converge(Filter(problem, CONTINUATION[0] * strong(problem)), start)
+    for share in CONTINUATION[1:]:
         end = end.then(converge(Filter(problem, share * strong(problem)), end.z))
     return end

@@ -1,13 +1,12 @@
-"""Suspects: effects that the model lacks or holds fixed, and how much of each the residuals ask for.
+"""Suspects: score tests of effects that the model lacks or holds fixed, and the uncertainty budget.
 
-Rao's score test, of one effect at a time: the residuals along what the effect would add to the samples, beside all that
-is estimated, are standard normal if the model is right. An effect that can only be positive is suspected on that side
-only. The effects are the rows of :mod:`emb_bench.estimate.effects`.
+Rao's score test of one effect: the residuals projected on the effect's regressor, orthogonal to all estimated columns,
+are standard normal if the model is right. The test of an effect that is never negative is one-sided. The effects are
+the rows of :mod:`emb_bench.estimate.effects`.
 
-The same numbers give the uncertainty budget: what an effect that is not estimated may have moved each unknown by, given
-the prior of the bench file and the residuals (:mod:`emb_bench.estimate.average`). A constant that is never exact is
-there with certainty; an effect that a brake may not have at all, with the probability ``PRESENT``. Where a filter found
-a disturbance, drifts may be larger, by ``DISTURBED``.
+The same numbers give the uncertainty budget: the bias of each unknown by an unmodelled effect, given the prior of the
+bench file and the residuals (:mod:`emb_bench.estimate.average`). A constant that is never exact is present with
+certainty, any other effect with the probability ``PRESENT``.
 """
 
 from __future__ import annotations
@@ -24,64 +23,66 @@ from emb_bench.brake.parameters import CURVED, PARAMETERS
 from emb_bench.config.machine import Machine
 from emb_bench.estimate.average import SHARES, Average, Influence, average, unaveraged
 from emb_bench.estimate.derived_velocity import derived
-from emb_bench.estimate.effects import DRIFTS, EFFECTS, LAGGING, Shown, columns, possible
+from emb_bench.estimate.effects import DRIFTS, EFFECTS, LAGGING, Prediction, columns, possible
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Cause, Contribution, JointScore, ModelValidation, Suspect
 from emb_runtime.config.bench import PARAMETER_NAMES
 
-PRESENT = 0.5  # Probability, before any experiment, that a brake has a certain one of the effects that are not certain
+PRESENT = 0.5  # Prior probability that a brake has a given effect that is not certain
 
 DISTURBED = 10.0
-"""Factor of what is known of drifts before an experiment in which something disturbs the brake: it may be a drift,
-which the random walk of a filter follows without an alarm."""
+"""Factor on the prior deviations of drifts if a disturbance was found: it may be a drift, which the random walk of a
+filter absorbs without an alarm."""
 
-ALIKE = 0.8  # Ratio of the scores of two suspects from which on both are about as sure
+ALIKE = 0.8  # Ratio of two scores above which the suspects are about equally significant
 DISTINGUISHED = 2.0  # Difference of two suspects' squared scores below which they are hardly distinguished
 
-DEPENDENT = 1e-6  # share of a regressor beside the others below which it is one of them
+DEPENDENT = 1e-6  # relative norm of a projected regressor below which it depends on the others
 
 
 class Lacking(NamedTuple):
     """Columns of k effects that a model lacks, as long as the m residuals."""
 
     names: tuple[str, ...]
-    beside: Floats  # Beside all that is fitted, shape (k, m); zero of one that is part of it
-    moved: Floats  # What a unit of each moves the p unknowns by, shape (k, p)
+    beside: Floats  # Orthogonal to all fitted columns, shape (k, m); zero for a dependent one
+    moved: Floats  # Bias of the p unknowns per unit of each, shape (k, p)
 
 
 def lacking(found: Mapping[str, Floats], basis: Floats, inverse: Floats) -> Lacking:
-    """The effects whose columns were found in a model with the ``inverse`` of its Jacobian.
+    """Projects the columns found on the complement of the fitted ones, and computes the biases.
 
-    The ``basis``, orthonormal, is of all that is fitted.
+    ``basis``: orthonormal basis of all fitted columns; ``inverse``: pseudo-inverse of the Jacobian.
     """
-    whole = np.array([*found.values()]).reshape(-1, len(basis))
-    beside = np.array([row - basis @ (basis.T @ row) for row in whole]).reshape(whole.shape)
-    beside[np.linalg.norm(beside, axis=1) <= DEPENDENT * np.linalg.norm(whole, axis=1)] = 0.0
-    return Lacking(tuple(found), beside, np.array([inverse @ row for row in whole]))
+    rows = np.array([*found.values()]).reshape(-1, len(basis))
+    beside = np.array([row - basis @ (basis.T @ row) for row in rows]).reshape(rows.shape)
+    beside[np.linalg.norm(beside, axis=1) <= DEPENDENT * np.linalg.norm(rows, axis=1)] = 0.0
+    return Lacking(tuple(found), beside, np.array([inverse @ row for row in rows]))
 
 
 def score(
     problem: Problem,
     z: Floats,
-    left: tuple[Floats, Floats],
+    linearised: tuple[Floats, Floats],
     basis: Floats,
-    shown: Shown,
+    prediction: Prediction,
     ratio: float,
     *,
     disturbed: bool = False,
 ) -> tuple[tuple[Suspect, ...], tuple[Contribution, ...], JointScore | None]:
-    """Score tests of all effects that are not estimated: most suspicious first, their budget, all of them together.
+    """Score tests of the effects that are not estimated, most significant first; their budget; the joint test.
 
-    Residuals and their derivatives to z are ``left`` at the estimate, the ``basis``, orthonormal, is of what they are
-    fitted with, and the noise may be larger than the bench says by the ``ratio`` χ²/n. ``disturbed`` says that a
+    ``linearised``: residuals at the estimate and their derivatives to z. ``basis``: orthonormal basis of all fitted
+    columns. ``ratio``: χ²/n, by which the variance of the noise may exceed the bench's. ``disturbed``: True if a
     disturbance was found.
     """
-    errors, allowed = left[0], problem.asked.allowed
-    names = tuple(name for name, row in EFFECTS.items() if row.tested or name in allowed)
-    found = lacking(columns(problem, z, shown, left[1], names), basis, basis_and_inverse(left[1])[1])
+    errors, jacobian = linearised
+    names = tuple(name for name, row in EFFECTS.items() if row.tested or name in problem.question.unmodelled)
+    found = lacking(columns(problem, z, prediction, jacobian, names), basis, basis_and_inverse(jacobian)[1])
     scores = np.array([row @ errors for row in found.beside])
     squares = np.array([np.linalg.norm(row) ** 2 for row in found.beside])
-    budget = budget_of(problem, average(problem, z, left), found, squares, scores, DISTURBED if disturbed else 1.0)
+    budget = budget_of(
+        problem, average(problem, z, linearised), found, squares, scores, DISTURBED if disturbed else 1.0
+    )
     tested = [i for i, name in enumerate(found.names) if EFFECTS[name].tested and squares[i] > 0.0]
     if not tested:
         return (), budget, None
@@ -99,17 +100,17 @@ def score(
     axes, values, _ = np.linalg.svd(
         (found.beside[together] / np.sqrt(squares[together])[:, None]).T, full_matrices=False
     )
-    kept = axes[:, values > 1e-3]
-    statistic, rank = float(np.sum((kept.T @ errors) ** 2)), kept.shape[1]
+    axes = axes[:, values > 1e-3]
+    statistic, rank = float(np.sum((axes.T @ errors) ** 2)), axes.shape[1]
     p_value = float(special.chdtrc(rank, statistic / max(ratio, 1.0)))
     return _with_observer(_ranked(suspects), problem), budget, JointScore(statistic, rank, p_value)
 
 
 def cause(m: ModelValidation, machine: Machine | None) -> Cause | None:
-    """The effect that explains a misfit, or the one that explains most of it; None without a significant one.
+    """The effect that explains a misfit, or most of it; None without a significant one.
 
-    The ``machine`` is that of a bench that has no brake. A score test is of first order: where an effect leaves a
-    misfit, its amount says little, not even that a brake cannot have it.
+    The ``machine`` is that of a bench without a brake. A score test is linear: of an effect that explains only a part
+    of the misfit the amount is unreliable, and an impossible amount does not exclude the effect.
     """
     lagging = next((s for s in m.suspects if s.observer and f"score of {s.name}" in m.alarming), None)
     if lagging is not None:
@@ -118,7 +119,7 @@ def cause(m: ModelValidation, machine: Machine | None) -> Cause | None:
     if not any(f"score of {s.name}" in m.alarming for s in found):
         return None
     possible = [s for s in found if s.possible or s.name in CURVED]
-    # Where none is left, or the size is no alarm, the amount must be one that a brake can have.
+    # An effect that explains all of the misfit, or a misfit without alarm by χ², needs a possible amount.
     if explaining := [s for s in found if _share(m, s) in (None, 1.0)]:
         possible = found = [s for s in possible if s in explaining]
     if not found:
@@ -126,7 +127,7 @@ def cause(m: ModelValidation, machine: Machine | None) -> Cause | None:
     most = max(s.fall for s in found)
     alike = [s for s in possible if s.fall >= ALIKE**2 * most]
     best = max(s.fall for s in alike or found) - DISTINGUISHED * m.ratio
-    # A recording is not made again: there an effect that can be estimated is named, if it is as sure.
+    # A recording cannot be repeated: of equally significant effects one that can be estimated is preferred.
     named = [s for s in alike if machine is not None and s.name in PARAMETERS]
     first = [*named, *(s for s in alike or found if s.fall >= best)][0]
     return _cause(m, first, possible=first in possible)
@@ -138,11 +139,11 @@ def _cause(m: ModelValidation, s: Suspect, *, possible: bool) -> Cause:
 
 
 def _share(m: ModelValidation, s: Suspect) -> float | None:
-    """Share of a misfit that an effect takes, as in :class:`Cause`."""
+    """Share of the misfit that an effect explains, as in :class:`Cause`."""
     if "size" not in m.alarming:
         return None
-    left = (m.chi2 - s.fall) / max(m.freedom - 1, 1)
-    return 1.0 if left <= m.expected[1] else min(s.fall / (m.chi2 - m.freedom), 0.999)
+    ratio = (m.chi2 - s.fall) / max(m.freedom - 1, 1)
+    return 1.0 if ratio <= m.expected[1] else min(s.fall / (m.chi2 - m.freedom), 0.999)
 
 
 def basis_and_inverse(jacobian: Floats) -> tuple[Floats, Floats]:
@@ -156,18 +157,18 @@ def basis_and_inverse(jacobian: Floats) -> tuple[Floats, Floats]:
 def budget_of(
     problem: Problem, averaged: Average, found: Lacking, squares: Floats, scores: Floats, drifting: float = 1.0
 ) -> tuple[Contribution, ...]:
-    """The budget of the effects that the total allows for, of those that are not tested with all priors in full.
+    """Uncertainty budget of the unmodelled effects; the biases of untested ones are with all priors in full.
 
-    From the ``squares`` of their columns beside the model, and the ``scores`` of the residuals; drifts are ``drifting``
-    times those of the bench file.
+    From the ``squares`` of their projected columns and the ``scores`` of the residuals; the prior deviations of drifts
+    are ``drifting`` times those of the bench file.
     """
-    allowed, budget = problem.asked.allowed, dict[str, Contribution]()
+    priors, budget = problem.question.unmodelled, dict[str, Contribution]()
     influences = {
         name: _influence(
-            problem, name, allowed[name] * (drifting if name in DRIFTS else 1.0), found.moved[i], square, scored
+            problem, name, priors[name] * (drifting if name in DRIFTS else 1.0), found.moved[i], square, scored
         )
         for i, (name, square, scored) in enumerate(zip(found.names, squares.tolist(), scores.tolist(), strict=True))
-        if name in allowed
+        if name in priors
     }
     for way, is_tested in ((averaged, True), (unaveraged(averaged.step), False)):
         names = [name for name in influences if EFFECTS[name].tested is is_tested]
@@ -180,20 +181,20 @@ def budget_of(
 def _influence(
     problem: Problem, name: str, prior: float, moved: Floats, information: float, scored: float
 ) -> Influence:
-    """An effect with the deviation ``prior`` of its size: what it moves the unknowns by, per unit, and its score."""
-    # What drifts is fitted as it is in the middle of a run, and meant from the begin to the end.
+    """An effect with the prior deviation ``prior`` of its size."""
+    # The fit gives the value in the middle of a drift; the interval has to cover the begin and the end.
     ends = np.array([0.5 if f"{u.name}_drift" == name else 0.0 for u in problem.unknowns])
-    if name == "J":  # all torques scale with it, those that are held as well: no trace is left
+    if name == "J":  # all torques scale with it, fixed ones as well: the residuals do not change
         moved, information, scored = np.array([float(u.name in PARAMETER_NAMES) for u in problem.unknowns]), 0.0, 0.0
     sizes, present = (np.ones(len(SHARES)), 1.0) if EFFECTS[name].is_certain else (np.array(SHARES), PRESENT)
     return Influence(moved, information, scored, prior * sizes, present, ends)
 
 
 def _ranked(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
-    """Most suspicious first; of those that are hardly distinguished, the one that comes first in ``EFFECTS``."""
+    """Most significant first; those that are hardly distinguished in the order of ``EFFECTS``."""
 
     def rank(s: Suspect) -> tuple[float, float]:
-        """Without the last digits, which differ between processors: two that act alike keep their order."""
+        """Without the last digits, which differ between processors."""
         suspicion = s.sigmas if EFFECTS[s.name].positive else abs(s.sigmas)
         return float(f"{s.p_value:.6g}"), -float(f"{suspicion:.6g}")
 
@@ -205,7 +206,7 @@ def _ranked(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
 
 
 def _with_observer(found: tuple[Suspect, ...], problem: Problem) -> tuple[Suspect, ...]:
-    """Suspects with the observer that derives the velocity, if an experiment shows one: the lag of it comes first."""
+    """Suspects with the observer that derives the velocity, if an experiment shows one; its lag comes first."""
     observed = problem.plant.instruments.observer_bandwidth > 0.0
     if observed or (observer := derived(problem.experiments, problem.bench.timing.sample_time)) is None:
         return found

@@ -1,19 +1,18 @@
-"""Output error over windows: multiple shooting in which each window begins where its own samples say.
+"""Output error over windows by multiple shooting.
 
-A machine without a spring has no place that it returns to: an error of its friction adds up over a recording, and after
-seconds the simulation is elsewhere. So a recording is cut into windows, each with the angle and the velocity at its
-start as unknowns of its own: multiple shooting (Bock, Numerical treatment of inverse problems in chemical reaction
-kinetics, 1981). The search goes over what all windows share, with each start where it fits best (variable projection:
-Golub and Pereyra 1973; its Jacobian is Kaufman's).
+A machine without a spring does not return to a rest position: an error of the friction accumulates over a recording,
+and the simulation diverges within seconds. So a recording is divided into windows, with the angle and velocity at the
+start of each window as unknowns: multiple shooting (Bock, Numerical treatment of inverse problems in chemical reaction
+kinetics, 1981). The search is over the shared parameters, each start at its optimum (variable projection: Golub and
+Pereyra 1973, with Kaufman's Jacobian).
 
-**Uncertainty.** A machine is disturbed by what no parameter stands for: ripple, friction that depends on the place.
-Such residuals follow from each other for as long as a window lasts, so that a window is the unit that counts: the
-covariance is H⁻¹ (Σ g g^T) H⁻¹ with the scores g of whole windows (Liang and Zeger, Biometrika 73, 1986), those of
-neighbours counted together (Newey and West 1987). What is wrong in all windows alike does not show in their scatter.
-But a wrong model weighs its errors otherwise in longer windows, and the right one does not (Hausman, Econometrica 46,
-1978): the estimate is made again from windows of another length, and what it moves by counts as a deviation.
+**Uncertainty.** Unmodelled disturbances such as ripple make the residuals of a window dependent. So the window is the
+unit of the covariance H⁻¹ (Σ g g^T) H⁻¹ with the scores g of the windows (cluster-robust: Liang and Zeger, Biometrika
+73, 1986), with the correlation of neighbours (Newey and West 1987). An error common to all windows does not show in
+their scatter. But the estimate of a wrong model depends on the length of the windows, that of the right one does not
+(Hausman, Econometrica 46, 1978): the difference to an estimate with another length is added as a deviation.
 
-Short windows leave little time for what disturbs the machine, long ones tell it better from the noise of the sensor.
+In short windows a disturbance has little effect; long ones are less sensitive to the sensors' noise.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from emb_bench.brake.parameters import OF_AN_EXPERIMENT
 from emb_bench.compiled import compiled
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.method import Method
-from emb_bench.estimate.model_validation import examine
+from emb_bench.estimate.model_validation import validate
 from emb_bench.estimate.output_error import start_points
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import FEWEST_WINDOWS, End, ModelValidation
@@ -44,24 +43,24 @@ from emb_runtime.errors import UsageError
 
 SHORTEST = 10  # Fewest samples of a window
 AROUND = 8  # Samples on each side of a window's start from which its velocity is taken, where none is measured
-RESTARTS = 4  # Most times that a search goes on from better starts of the windows
-RESTARTED = 1e-3  # Share of the cost by which a restart has to lower it to be followed by another
+RESTARTS = 4  # Most restarts of a search from better starts of the windows
+RESTARTED = 1e-3  # Relative fall of the cost below which there is no further restart
 HALVINGS = 12  # Most halvings of a step of a window's start
-STILL = 1e-9  # Share of a window's squares below which a step of its start ends the steps
-SETTLED = 4  # Steps in which the starts of windows settle for given parameters
-FOLLOWS = 0.97  # Largest correlation of neighbouring windows' scores that is reckoned with
+STILL = 1e-9  # Relative fall of a window's cost below which its start has converged
+SETTLED = 4  # Most Gauss-Newton steps of the starts for given parameters
+FOLLOWS = 0.97  # Largest correlation of neighbouring windows' scores
 START = ("x1_0", "x2_0")
 _LOST = 1e-9  # share of a start's largest singular value below which the samples do not tell it
 
-JUDGED = 5000  # Samples, in whole windows, that the model is validated on: an hour has millions, and these see as much
+JUDGED = 5000  # Samples of the windows in the model validation: an hour has millions, which tell no more
 OTHER = 4.0  # Ratio of the lengths of the windows in two estimates whose difference is counted
-REFINED = 2  # Searches that are carried to their ends: those whose first steps led lowest
+REFINED = 2  # Searches that are completed: those with the least cost after ``SHORT`` simulations
 BATCH = 20_000  # Samples of windows that are simulated together
-SHORT = 6  # Simulations of a search that is only begun
+SHORT = 6  # Simulations of a preliminary search
 
 
 class Windows(Method):
-    """Output error of all windows: the parameters that they share."""
+    """Output error of all windows, for the shared parameters."""
 
     def solve(self, problem: Problem) -> Estimate:
         """As :class:`Method`."""
@@ -83,15 +82,15 @@ class Point(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Some windows at a point: what they add to the normal equations once their starts are eliminated.
+    """Linearised windows at a point.
 
-    The m rows of a window are its samples; those that do not count, or that a shorter window lacks, are zero.
+    The m rows of a window are its samples; rows without a sample are zero.
     """
 
     errors: Floats  # Of the samples in standard deviations, shape (w, m)
-    shared: Floats  # Derivatives of what is shown to the shared unknowns, shape (w, m, p)
-    own: Floats  # Derivatives to the starts, shape (w, m, 2)
-    inverse: Floats  # Pseudo-inverses of those, shape (w, 2, m)
+    shared: Floats  # Derivatives of the prediction to the shared unknowns, shape (w, m, p)
+    local: Floats  # Derivatives to the starts, shape (w, m, 2)
+    inverse: Floats  # Pseudo-inverses of ``local``, shape (w, 2, m)
 
     @property
     def costs(self) -> Floats:
@@ -105,17 +104,17 @@ class Rows(NamedTuple):
         return _times(self.inverse, self.errors)
 
     def projected(self) -> tuple[Floats, Floats]:
-        """Errors and derivatives beside what the starts take up."""
-        return self.errors - _times(self.own, self.steps), self.shared - self.own @ (self.inverse @ self.shared)
+        """Errors and derivatives with the starts projected out."""
+        return self.errors - _times(self.local, self.steps), self.shared - self.local @ (self.inverse @ self.shared)
 
-    def at(self, chosen: Integers | Booleans) -> Rows:
-        """Some of them."""
-        return Rows(*(rows[chosen] for rows in self))
+    def at(self, index: Integers | Booleans) -> Rows:
+        """The rows of some windows."""
+        return Rows(*(rows[index] for rows in self))
 
-    def put(self, chosen: Integers | Booleans, others: Rows) -> None:
-        """Put others in the place of some."""
+    def put(self, index: Integers | Booleans, others: Rows) -> None:
+        """Replace the rows of some windows."""
         for rows, new in zip(self, others, strict=True):
-            rows[chosen] = new
+            rows[index] = new
 
 
 def _times(matrices: Floats, vectors: Floats) -> Floats:
@@ -125,16 +124,18 @@ def _times(matrices: Floats, vectors: Floats) -> Floats:
 
 
 class Cut:
-    """The experiments of a problem in windows, weighted at shared unknowns and at the starts where they were seen."""
+    """The experiments of a problem in windows, weighted at shared unknowns and measured starts."""
 
     def __init__(self, problem: Problem, shared: Floats) -> None:
         length = max(round(problem.window / problem.bench.timing.sample_time), SHORTEST)
-        asked = replace(problem.asked, nuisances=(*problem.asked.nuisances, *START))
+        question = replace(problem.question, nuisances=(*problem.question.nuisances, *START))
         self.problem = problem
         self.spans = [span for i in range(len(problem.experiments)) for span in _spans(problem, i, length)]
         if not self.spans:
             raise UsageError(f"method windows: no window of {length} periods has {SHORTEST} samples: expected longer")
-        self.windows = [replace(problem, asked=asked, experiments=(_window(problem, span),)) for span in self.spans]
+        self.windows = [
+            replace(problem, question=question, experiments=(_window(problem, span),)) for span in self.spans
+        ]
         self.begun = Point(shared, np.array([window.nominal()[-len(START) :] for window in self.windows]))
         self.weights = [
             window.weights(np.append(shared, start))[0]
@@ -148,7 +149,7 @@ class Cut:
         self.samples = self._below(self.inside, np.concatenate([w.experiments[0].samples for w in self.windows]))
 
     def searches(self, values: Sequence[Floats]) -> list[tuple[Point, End]]:
-        """Searches from shared unknowns, best first; of several most are only begun."""
+        """Searches from shared unknowns, best first; most of several are preliminary only."""
         p = len(self.problem.unknowns)
         if len(self.windows) < FEWEST_WINDOWS * p:
             raise UsageError(
@@ -161,9 +162,9 @@ class Cut:
         return sorted((self.search(z) for z in values), key=lambda pair: pair[1].cost)
 
     def search(self, shared: Floats, evaluations: int = EVALUATIONS) -> tuple[Point, End]:
-        """One local search over what the windows share, again from better starts as long as there are any.
+        """One local search over the shared unknowns, with restarts from better starts of the windows.
 
-        With fewer ``evaluations`` than ``EVALUATIONS`` the search is only begun.
+        With fewer ``evaluations`` than ``EVALUATIONS`` there is no restart.
         """
         at, end = self._descended(self.begun._replace(shared=shared), evaluations)
         total = end.evaluations
@@ -186,7 +187,7 @@ class Cut:
             parts = [
                 np.concatenate([columns, errors[:, :, None]], axis=2) for errors, columns in map(Rows.projected, found)
             ]
-            # A search asks for the squares alone: their triangular root says the same in a few rows.
+            # The search needs only the normal equations: the triangular factor has the same ones, in a few rows.
             rows: Floats = np.concatenate([part.reshape(-1, part.shape[2]) for part in parts])
             root: Floats = np.asarray(np.linalg.qr(rows, "r"))
             return root[:, -1], -root[:, :-1]
@@ -195,9 +196,9 @@ class Cut:
         return self.settled(at._replace(shared=end.z))[0], end
 
     def restarted(self, at: Point) -> Point:
-        """Each window at the better one of its start and of where it was seen to start, parameters unchanged.
+        """Each window at the better one of its current and its measured start, parameters unchanged.
 
-        A window may have come to stick, or to move where the machine stuck, and nothing at its own start leads it back.
+        A window may stick where the machine moved, or move where it stuck; there the cost has no gradient back.
         """
         fresh, found = self.settled(Point(at.shared, self.begun.starts))
         pairs = zip(found, self.linearised(at), strict=True)
@@ -206,55 +207,55 @@ class Cut:
 
     def linearised(self, at: Point) -> list[Rows]:
         """Contributions of the windows at a point, in batches."""
-        return [self._linearised(chosen, at.shared, at.starts[chosen]) for chosen in self.batches]
+        return [self._linearised(batch, at.shared, at.starts[batch]) for batch in self.batches]
 
-    def _linearised(self, chosen: Integers, shared: Floats, starts: Floats) -> Rows:
-        said, inside, roots = self._predicted(chosen, shared, starts), self.inside[chosen], self.roots[chosen]
-        errors = np.nan_to_num(self.samples[chosen] - self._below(inside, said.samples)) * roots
-        rows = self._below(inside, said.sensitivities.transpose(0, 2, 1)) * roots[..., None]
-        rows = rows.reshape(len(chosen), -1, rows.shape[-1])
-        own = rows[:, :, -len(START) :]
-        lengths = np.linalg.norm(own, axis=1, keepdims=True)
+    def _linearised(self, batch: Integers, shared: Floats, starts: Floats) -> Rows:
+        predicted, inside, roots = self._predicted(batch, shared, starts), self.inside[batch], self.roots[batch]
+        errors = np.nan_to_num(self.samples[batch] - self._below(inside, predicted.samples)) * roots
+        rows = self._below(inside, predicted.sensitivities.transpose(0, 2, 1)) * roots[..., None]
+        rows = rows.reshape(len(batch), -1, rows.shape[-1])
+        local = rows[:, :, -len(START) :]
+        lengths = np.linalg.norm(local, axis=1, keepdims=True)
         unit = np.where(lengths > 0.0, lengths, 1.0)
-        inverse = np.linalg.pinv(own / unit, rcond=_LOST) / unit.transpose(0, 2, 1)
-        return Rows(errors.reshape(len(chosen), -1), rows[:, :, : -len(START)], own, inverse)
+        inverse = np.linalg.pinv(local / unit, rcond=_LOST) / unit.transpose(0, 2, 1)
+        return Rows(errors.reshape(len(batch), -1), rows[:, :, : -len(START)], local, inverse)
 
-    def _predicted(self, chosen: Integers, shared: Floats, starts: Floats) -> Trajectory:
-        """Predicts windows from their starts, the samples of one below those of the other."""
+    def _predicted(self, batch: Integers, shared: Floats, starts: Floats) -> Trajectory:
+        """Predicts windows from their starts, samples stacked."""
         one, z = self.windows[0], np.append(shared, starts[0])
         plant = replace(one.plant, mechanics=one.mechanics(z))
-        parts = [self.windows[i].experiments[0] for i in chosen]
+        parts = [self.windows[i].experiments[0] for i in batch]
         t_s = one.bench.timing.sample_time
         return simulate_apart(plant, one.at(z, 0), parts, starts, t_s, one.names(0), compiled(march))
 
     def _below(self, inside: Booleans, rows: Floats) -> Floats:
-        """Rows of outputs that count, one window below the other, apart: shape (w, m, outputs, ...)."""
+        """Stacked rows split by window, outputs that count only: shape (w, m, outputs, ...)."""
         apart = np.zeros((*inside.shape, len(self.outputs), *rows.shape[2:]))
         apart[inside] = rows[:, self.outputs]
         return apart
 
     def settled(self, at: Point) -> tuple[Point, list[Rows]]:
-        """The starts moved to where they fit best, the shared unknowns as they are; and the windows there."""
-        found = [self._settled(chosen, at.shared, at.starts[chosen]) for chosen in self.batches]
+        """The optimal starts for given shared unknowns, and the windows linearised there."""
+        found = [self._settled(batch, at.shared, at.starts[batch]) for batch in self.batches]
         return Point(at.shared, np.concatenate([starts for starts, _ in found])), [rows for _, rows in found]
 
-    def _settled(self, chosen: Integers, shared: Floats, starts: Floats) -> tuple[Floats, Rows]:
-        """Starts of windows after damped Gauss-Newton steps, none of which raises the squares of a window.
+    def _settled(self, batch: Integers, shared: Floats, starts: Floats) -> tuple[Floats, Rows]:
+        """Starts of windows after damped Gauss-Newton steps, none of which raises the cost of a window.
 
-        Near rest a step may be far too long: the samples of a brake that friction holds hardly depend on its start.
+        Near rest a step may be far too long: the samples of a sticking brake hardly depend on its start.
         """
-        rows, going = self._linearised(chosen, shared, starts), np.arange(len(chosen))
+        rows, going = self._linearised(batch, shared, starts), np.arange(len(batch))
         for _ in range(SETTLED):
-            left, steps, costs, gained = going, rows.at(going).steps, rows.costs, np.zeros(len(chosen))
+            trying, steps, costs, gained = going, rows.at(going).steps, rows.costs, np.zeros(len(batch))
             for _ in range(HALVINGS):
-                trial = self._linearised(chosen[left], shared, starts[left] + steps)
-                lower = trial.costs <= costs[left]
-                moved = left[lower]
+                trial = self._linearised(batch[trying], shared, starts[trying] + steps)
+                lower = trial.costs <= costs[trying]
+                moved = trying[lower]
                 starts[moved] += steps[lower]
                 rows.put(moved, trial.at(lower))
                 gained[moved] = costs[moved] - trial.costs[lower]
-                left, steps = left[~lower], 0.5 * steps[~lower]
-                if not len(left):
+                trying, steps = trying[~lower], 0.5 * steps[~lower]
+                if not len(trying):
                     break
             going = going[gained[going] > STILL * costs[going]]
             if not len(going):
@@ -263,11 +264,11 @@ class Cut:
 
     def residuals(self, at: Point) -> Iterator[tuple[Span, Floats, Floats]]:
         """Span, errors of the samples [rad, rad/s] and their weights of each window, shapes (n, 2)."""
-        shown = [self._predicted(chosen, at.shared, at.starts[chosen]).samples for chosen in self.batches]
+        predicted = [self._predicted(batch, at.shared, at.starts[batch]).samples for batch in self.batches]
         ends = np.cumsum([end - begin for _, begin, end in self.spans])
-        apart = np.split(np.concatenate(shown), ends[:-1])
-        for window, said, span, root in zip(self.windows, apart, self.spans, self.weights, strict=True):
-            yield span, window.experiments[0].samples - said, root
+        apart = np.split(np.concatenate(predicted), ends[:-1])
+        for window, samples, span, root in zip(self.windows, apart, self.spans, self.weights, strict=True):
+            yield span, window.experiments[0].samples - samples, root
 
     @property
     def follows(self) -> list[bool]:
@@ -276,12 +277,12 @@ class Cut:
 
 
 def _other(problem: Problem, shared: Floats) -> Floats:
-    """The shared unknowns from windows of another length: longer ones, or shorter where those would be too few."""
+    """The shared unknowns from windows of another length: longer, or shorter if there were too few."""
     seconds = sum(experiment.periods for experiment in problem.experiments) * problem.bench.timing.sample_time
     length = problem.window * OTHER
     if FEWEST_WINDOWS * len(shared) * length > seconds:
         length = problem.window / OTHER
-    return Cut(replace(problem, asked=replace(problem.asked, window=length)), shared).search(shared)[0].shared
+    return Cut(replace(problem, question=replace(problem.question, window=length)), shared).search(shared)[0].shared
 
 
 def predict_windows(problem: Problem, values: Floats) -> tuple[float, float, int]:
@@ -311,7 +312,7 @@ def _sums(found: Sequence[Rows]) -> tuple[Floats, Floats]:
 
 
 def _finished(cut: Cut, at: Point, ends: tuple[End, ...], moved: Floats) -> Estimate:
-    """Estimate of what the windows share, which another length of them moves, with its validation."""
+    """Estimate of the shared unknowns with its validation; ``moved`` is the change by another length of windows."""
     problem = cut.problem
     information, scores = _sums(cut.linearised(at))
     covariance = by_windows(information, scores, cut.follows)
@@ -337,10 +338,10 @@ def _validated(cut: Cut, at: Point) -> ModelValidation:
     """Tests of the model on windows spread over the experiments."""
     count = len(cut.windows)
     few_enough = max(JUDGED // len(cut.windows[0].experiments[0].currents), 2)
-    chosen = sorted({round(k) for k in np.linspace(0, count - 1, min(count, few_enough)).tolist()})
-    few = replace(cut.windows[0], experiments=tuple(cut.windows[i].experiments[0] for i in chosen))
-    z, roots = np.concatenate([at.shared, at.starts[chosen].T.ravel()]), [cut.weights[i] for i in chosen]
-    return examine(few, z, roots, few.jacobian(z, roots))
+    index = sorted({round(k) for k in np.linspace(0, count - 1, min(count, few_enough)).tolist()})
+    few = replace(cut.windows[0], experiments=tuple(cut.windows[i].experiments[0] for i in index))
+    z, roots = np.concatenate([at.shared, at.starts[index].T.ravel()]), [cut.weights[i] for i in index]
+    return validate(few, z, roots, few.jacobian(z, roots))
 
 
 Span = tuple[int, int, int]
@@ -360,8 +361,8 @@ def _spans(problem: Problem, number: int, length: int) -> Iterator[Span]:
 def _window(problem: Problem, span: Span) -> Experiment:
     """One window; one that begins with lost samples starts from the last that was received.
 
-    An observer's velocity lags: instead of it a window starts with the slope of a parabola through the angles around
-    its start. One that starts too slow may stick where the machine did not, and then nothing says which way to go.
+    An observer's velocity lags: a window starts with the slope of a parabola through the angles around its start
+    instead. With too low a velocity it may stick where the machine moved, and the cost would have no gradient.
     """
     number, begin, end = span
     experiment = problem.experiments[number]
@@ -385,7 +386,7 @@ def _slope(angles: Floats, at: int, t_s: float) -> float:
 
 
 def by_windows(information: Floats, scores: Floats, follows: Sequence[bool]) -> Floats:
-    """Covariance from the scatter of the windows: H⁻¹ (Σ g g^T) H⁻¹, neighbours counted together, shape (p, p).
+    """Cluster-robust covariance H⁻¹ (Σ g g^T) H⁻¹, with the correlation of neighbouring windows, shape (p, p).
 
     From the information H and the scores g of each window, shape (m, p); ``follows`` is True for a window that begins
     where the one before it ends. The diagonal is inf for unknowns that the windows do not identify.
@@ -396,9 +397,9 @@ def by_windows(information: Floats, scores: Floats, follows: Sequence[bool]) -> 
 
 
 def scatter(scores: Floats, follows: Sequence[bool]) -> Floats:
-    """Σ g g^T of scores, those of neighbouring windows counted together (Newey and West 1987), shape (p, p).
+    """Σ g g^T of scores with the correlation of neighbouring windows (Newey and West 1987), shape (p, p).
 
-    The scores say themselves how far they follow from each other (Andrews, Econometrica 59, 1991).
+    The number of lags follows from the scores' correlation (Andrews, Econometrica 59, 1991).
     """
     m = len(scores)
     meat: Floats = scores.T @ scores

@@ -1,17 +1,16 @@
 """Optimality criteria D, A and E of a Fisher information matrix: values, of one or of many, and gradients.
 
 D is log |M|, A is tr M⁻¹, E is λ_min (Atkinson, Donev and Tobias, Optimum Experimental Designs, with SAS, 2007, chapter
-10); of some parameters while the others are unknown too D is called Ds. There are three ways to compute them:
+10); D of some parameters, with the others as nuisances, is called Ds. There are three ways to compute them:
 
-- :func:`criteria` and :func:`criteria_series` report on an experiment: accurate whatever the scales of the parameters,
-  and a singular matrix has the worst values there are, never a NaN;
-- :class:`Criterion` is what a search maximises: a concave function φ with its gradient, which has a slope to climb at a
-  singular matrix too;
-- compiled loops over small matrices get them, and φ too, from a Cholesky factor
-  (:mod:`emb_bench.information.symmetric`).
+- :func:`criteria` and :func:`criteria_series` for reports: accurate for parameters of any scale; a singular matrix has
+  the worst values, never a NaN;
+- :class:`Criterion` for searches: a concave function φ with its gradient, which is not zero at a singular matrix;
+- :mod:`emb_bench.information.symmetric` for compiled loops over small matrices: the criteria and φ from a Cholesky
+  factor.
 
-A design's φ are all logarithms, so that they share a scale: 0.1 is worth as much, whatever the criterion. Concavity
-gives the tangent bound φ(M) ≤ φ(M₀) + tr(∇φ(M₀) (M − M₀)), on which the search rests.
+All φ are logarithms: a difference of 0.1 has the same weight for each criterion. Concavity gives the tangent bound
+φ(M) ≤ φ(M₀) + tr(∇φ(M₀) (M − M₀)), which the search uses.
 """
 
 from __future__ import annotations
@@ -38,28 +37,28 @@ from emb_runtime.errors import UsageError
 Name = Literal["D", "A", "E"]
 
 FLOOR = 1e-13
-"""Eigenvalues below this share of the largest count as this share: a singular start still has a slope to climb."""
+"""Eigenvalues below this share of the largest count as this share, so that φ has a gradient at a singular start."""
 
 
 @dataclass(frozen=True)
 class Criteria:
     """Criteria of one FIM. Higher is better for D and E, lower for A and the condition number.
 
-    A singular FIM has the worst values there are: −inf, inf, 0, inf. One that is nearly so has finite ones: a
-    :class:`Identifiability` judges whether the parameters are identified.
+    A singular FIM has the worst values: −inf, inf, 0, inf. A nearly singular one has finite values; whether its
+    parameters are identified is decided by :func:`~emb_bench.information.identifiability.identifiability`.
     """
 
     log_det: float  # D: log |M|; of a subset Ds: log of the determinant of its Schur complement
     trace_inverse: float  # A: tr M⁻¹
     lambda_min: float  # E: smallest eigenvalue of M
     condition: float  # Modified E: largest over smallest eigenvalue
-    singular: bool  # True if, to rounding, some combination of parameters leaves no trace in the data
-    weakest: Mapping[str, float]  # The combination of relative parameters that is identified worst, as a unit vector
+    singular: bool  # True if a combination of parameters does not change the data, to rounding
+    weakest: Mapping[str, float]  # Combination of relative parameters with the largest variance, unit vector
     flat: tuple[Mapping[str, float], ...]
     """Combinations that are not identified at all, as unit vectors; empty unless singular."""
 
-    def shown(self, machine: Machine | None) -> Criteria:
-        """Criteria by the names that a machine's unknowns are shown by."""
+    def renamed(self, machine: Machine | None) -> Criteria:
+        """Criteria with a machine's names of the unknowns."""
         flat = tuple(renamed(direction, machine) for direction in self.flat)
         return replace(self, weakest=renamed(self.weakest, machine), flat=flat)
 
@@ -67,7 +66,7 @@ class Criteria:
 def criteria(matrix: Any, params: Sequence[str], interest: Sequence[str] | None = None) -> Criteria:
     """D, A, E, condition number and the worst identified combination of an FIM, or of a subset of its parameters.
 
-    The parameters that are of no ``interest`` are unknown nuisances: the Schur complement is judged (Ds-optimality).
+    Parameters that are not of ``interest`` are nuisances: the criteria are of the Schur complement (Ds-optimality).
     """
     names = list(params if interest is None else interest)
     if not names or not set(names) <= set(params):
@@ -76,7 +75,7 @@ def criteria(matrix: Any, params: Sequence[str], interest: Sequence[str] | None 
     spectrum = Spectrum(matrix)
     if spectrum.lost[index].any():
         parts = [v[index] for v in spectrum.flat_directions()]
-        # Of a parameter that is only just lost, no direction may have much: then the one that has most.
+        # A barely lost parameter may have small shares only: then the direction with the largest one counts.
         directions = [d for d in parts if (np.abs(d) > TOUCHED).any()] or [max(parts, key=lambda d: np.abs(d).max())]
         flat = tuple(dict(zip(names, unit_vector(d).tolist(), strict=True)) for d in directions)
         return Criteria(-math.inf, math.inf, 0.0, math.inf, True, flat[0], flat)
@@ -112,26 +111,26 @@ def _of_covariance(covariance: Floats) -> Series:
 
 
 def criteria_series(matrices: Floats, params: Sequence[str], interest: Sequence[str]) -> Series:
-    """D, E and A of many FIMs, such as those of an experiment as it goes on: to rounding, :func:`criteria` of each."""
+    """D, E and A of many FIMs, such as those after each sample of an experiment: :func:`criteria` to rounding."""
     index = [list(params).index(name) for name in interest]
     diagonals = np.diagonal(matrices, axis1=1, axis2=2)
     found = Series(*(np.full(len(matrices), worst) for worst in (-math.inf, 0.0, math.inf)))
-    # Of a parameter without any information no matrix has to be looked at; the first samples have many such.
+    # A parameter of interest without information gives the worst values at once: that of many first samples.
     sound = np.isfinite(matrices).all(axis=(1, 2)) & (diagonals >= 0.0).all(axis=1)
-    left = ~(sound & (diagonals[:, index] == 0.0).any(axis=1))
-    whole = np.flatnonzero(sound & (diagonals > 0.0).all(axis=1))
-    unit = np.sqrt(diagonals[whole])
-    values, vectors = np.linalg.eigh(matrices[whole] / (unit[:, :, None] * unit[:, None, :]))
+    remaining = ~(sound & (diagonals[:, index] == 0.0).any(axis=1))
+    full = np.flatnonzero(sound & (diagonals > 0.0).all(axis=1))
+    unit = np.sqrt(diagonals[full])
+    values, vectors = np.linalg.eigh(matrices[full] / (unit[:, :, None] * unit[:, None, :]))
     regular = (values > SINGULAR * len(params)).all(axis=1)
-    whole, unit, values, vectors = whole[regular], unit[regular], values[regular], vectors[regular]
-    rows = vectors[:, index]  # of the scaled inverse: those that count
+    full, unit, values, vectors = full[regular], unit[regular], values[regular], vectors[regular]
+    rows = vectors[:, index]  # of interest
     inverse = (rows / values[:, None, :]) @ rows.transpose(0, 2, 1) / (unit[:, index, None] * unit[:, None, index])
     for numbers, of_regular in zip(found, _of_covariance(inverse), strict=True):
-        numbers[whole] = of_regular
+        numbers[full] = of_regular
     if len(index) == len(params):
-        found.log_det[whole] = 2.0 * np.log(unit).sum(axis=1) + np.log(values).sum(axis=1)
-    left[whole] = False
-    for k in np.flatnonzero(left).tolist():  # nearly singular, or wrong
+        found.log_det[full] = 2.0 * np.log(unit).sum(axis=1) + np.log(values).sum(axis=1)
+    remaining[full] = False
+    for k in np.flatnonzero(remaining).tolist():  # nearly singular, or wrong
         one = criteria(matrices[k], params, interest)
         found.log_det[k], found.lambda_min[k], found.trace_inverse[k] = one.log_det, one.lambda_min, one.trace_inverse
     return found
@@ -179,7 +178,7 @@ class Criterion:
         return {"D": LOG_DET, "A": MINUS_LOG_TRACE, "E": LOG_LAMBDA_MIN}[self.name]
 
     def value(self, phi: float) -> float:
-        """The criterion in its own unit: log |M|, tr M⁻¹, λ_min."""
+        """The criterion itself: log |M|, tr M⁻¹ or λ_min."""
         return float({"D": phi, "A": np.exp(-phi), "E": np.exp(phi)}[self.name])
 
     @property
@@ -191,8 +190,8 @@ class Criterion:
 def distances(matrices: Floats, other: Floats) -> Floats:
     """Largest |log vᵀMv − log vᵀM'v| over all v, of each of some FIMs M, shape (count, p, p), and another one M'.
 
-    It is the largest |log λ| of their generalised eigenvalues: 0.1 if of some combination of parameters, of whatever
-    unit, one has a tenth more information than the other.
+    This is the largest |log λ| of their generalised eigenvalues: 0.1 if one has 10 % more information on some
+    combination of parameters than the other.
     """
     values, vectors = np.linalg.eigh(other)
     root = vectors / np.sqrt(np.maximum(values, max(FLOOR * values[-1], 1e-300)))

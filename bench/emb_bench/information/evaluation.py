@@ -1,4 +1,4 @@
-"""Fisher information of a recorded experiment about the brake, with one model of it, and the fit of that model."""
+"""Fisher information of recorded or planned experiments, for one model of the brake, and the fit of that model."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Fit:
     """
 
     angle: float
-    velocity: float | None  # None of a velocity that an observer derives: it is no measurement of its own
+    velocity: float | None  # None of an observer's velocity, which is not measured
     samples: int
 
     @property
@@ -60,7 +60,7 @@ class Fit:
 
 
 PIECE = 8192  # Periods that are evaluated together
-INSTANTS = 1000  # Instants after which the information is kept; of a record that is no longer, after each sample
+INSTANTS = 1000  # Most instants of the information over time
 
 
 def information_and_fit(
@@ -73,40 +73,40 @@ def information_and_fit(
     instants: Sequence[int] = (),
     piece: int = PIECE,
 ) -> tuple[Mapping[Kind, Floats], Fit]:
-    """Fisher information of an experiment about some unknowns over time, by kind, and the fit of the model.
+    """Fisher information of an experiment over time, by kind, and the fit of the model.
 
     The information, shape (instants, p, p), is that after the periods ``instants``, in ascending order; the physical
-    one begins at ``start``, shape (p, p). Samples count as on the grid, and what acted as it is assumed in gaps. The
-    experiment goes through the model in pieces of some periods.
+    one begins at ``start``, shape (p, p). Samples are at the instants of the grid, with the assumed currents in gaps.
+    The simulation runs in pieces of ``piece`` periods.
 
-    A measurement delay of the model shifts what a sample measures: the first ones show the brake before the experiment
-    and inform of the encoder's offset and of the start alone. The jitter of the clock makes the standard deviations
-    larger where the brake is fast. An observer's velocity is not compared.
+    With a measurement delay the first samples measure the brake before the experiment, and have information on the
+    encoder's offset and the start only. Jitter of the clock increases the standard deviations of a fast brake. An
+    observer's velocity is not compared.
     """
     nothing, at = np.zeros((len(names), len(names))), np.asarray(instants, np.int64)
     totals: dict[Kind, Floats] = {"physical": nothing if start is None else start, "weighted": nothing}
-    kept: dict[Kind, list[Floats]] = {kind: [np.empty((0, *nothing.shape))] for kind in KINDS}
+    histories: dict[Kind, list[Floats]] = {kind: [np.empty((0, *nothing.shape))] for kind in KINDS}
     squares, count, done = np.zeros(2), 0, 0
     pieces = list(on_grid(experiment).split(piece))
     loop = fast_loop(experiment.periods)
-    shown = simulate_parts(plant, theta, pieces, bench.timing.sample_time, names, loop) if pieces else ()
-    for part, motion in zip(pieces, shown, strict=True):
-        wanted = at[(at >= done) & (at < done + part.periods)] - done
+    predicted = simulate_parts(plant, theta, pieces, bench.timing.sample_time, names, loop) if pieces else ()
+    for part, motion in zip(pieces, predicted, strict=True):
+        inside = at[(at >= done) & (at < done + part.periods)] - done
         for kind in KINDS if names else ():
             weights = weights_along(bench, kind, plant.instruments, motion.states)
             history = information_over_time(motion.sensitivities, weights, totals[kind], part.measured)
             totals[kind] = history[-1]
-            kept[kind].append(history[wanted])
+            histories[kind].append(history[inside])
         roots = np.sqrt(weights_along(bench, "physical", plant.instruments, motion.states))
         distances = ((part.samples - motion.samples) * roots)[part.measured]
         squares, count, done = squares + np.sum(distances**2, axis=0), count + len(distances), done + part.periods
     angle, velocity = np.sqrt(squares / max(count, 1)).tolist()
     fit = Fit(angle, None if plant.instruments.observer_bandwidth > 0.0 else velocity, count)
-    return {kind: np.concatenate(parts) for kind, parts in kept.items()}, fit
+    return {kind: np.concatenate(parts) for kind, parts in histories.items()}, fit
 
 
 def on_grid(experiment: Experiment) -> Experiment:
-    """The experiment with samples as on the grid, and with the currents that are assumed in gaps."""
+    """The experiment with samples at the instants of the grid, and with the assumed currents in gaps."""
     return replace(experiment, late=None, assumed=None, places=None)
 
 
@@ -116,7 +116,7 @@ class Question:
 
     params: tuple[str, ...] = PARAMETER_NAMES  # The parameters of interest
     nuisances: tuple[str, ...] = ()  # Other unknown parameters, of no interest
-    prior: Ranges | None = None  # Ranges of the parameters known before the experiment
+    prior: Ranges | None = None  # Prior ranges of the parameters
 
     def __post_init__(self) -> None:
         """Check the names."""
@@ -133,7 +133,7 @@ class Question:
 
     @property
     def varied(self) -> tuple[str, ...]:
-        """Names of the parameters that the prior is about."""
+        """Names of the parameters with a prior."""
         p = self.prior
         return tuple(n for n in self.names if p and getattr(p.low, n, 0.0) < getattr(p.high, n, 0.0))
 
@@ -149,18 +149,18 @@ class Question:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Information:
-    """Fisher information about one brake, and how it grew: of a record, of planned currents, or of several together."""
+    """Fisher information about one brake over time: of a recorded experiment, of planned currents, or of several."""
 
     bench: Bench
     plant: Plant  # The model
     theta: BrakeParameters  # Parameters at which the information was computed, and to which relative values refer
-    errors: SystematicErrors  # Systematic errors that were known besides
+    errors: SystematicErrors  # Given systematic errors
     question: Question
     experiment: Experiment | None  # None of several together
     instants: Sequence[int]
-    """Periods after which the information was kept, the last one among them; all of them if they are not too many."""
+    """Periods after which ``histories`` have the information; the last one is among them."""
     histories: Mapping[Kind, Floats]
-    """The FIM after each of them, shape (instants, p, p), by kind; the physical one begins at the prior."""
+    """FIM after each of ``instants``, shape (instants, p, p), by kind; the physical one begins at the prior."""
 
     def __repr__(self) -> str:
         """Model and bounds in one line."""
@@ -214,7 +214,7 @@ class Information:
         """Motion of the brake under the currents, samples without noise, and their sensitivities.
 
         Raises:
-            UsageError: these are several runs, each of which has its own.
+            UsageError: the information is of several runs.
         """
         if self.experiment is None:
             raise UsageError("each run has a trajectory of its own: expected the information of one of them")
@@ -237,19 +237,19 @@ class Information:
         return pd.DataFrame(self.matrix, self.params, self.params)
 
     def fisher(self, kind: Kind) -> Fisher:
-        """The Fisher information of the whole experiment."""
-        asked = self.question
-        prior = asked.start(self.theta) if kind == "physical" else None
+        """The Fisher information at the end of the experiment."""
+        question = self.question
+        prior = question.start(self.theta) if kind == "physical" else None
         matrix = self.histories[kind][-1]
-        return Fisher(kind, asked.names, self.theta, matrix, prior, self.plant.name, asked.nuisances)
+        return Fisher(kind, question.names, self.theta, matrix, prior, self.plant.name, question.nuisances)
 
-    def verdict(self) -> Identifiability:
-        """Parameters that can be identified from the record, and those that cannot."""
-        return self.fisher("physical").verdict(self.question.prior)
+    def identifiability(self) -> Identifiability:
+        """Identifiability of each parameter from the experiment."""
+        return self.fisher("physical").identifiability(self.question.prior)
 
     @property
     def absent(self) -> tuple[str, ...]:
-        """Unknowns that are zero in the model: relative to zero they have no sensitivity, whatever the brake has."""
+        """Unknowns that are zero in the model, and so have no relative sensitivity."""
         has = self.plant.mechanics._asdict()
         return tuple(name for name in self.question.names if has.get(name) == 0.0)
 
@@ -270,17 +270,17 @@ class Evaluation(Information):
 
 
 def together(parts: Sequence[Information]) -> Information:
-    """The information of several experiments with one brake: they add, at the parameters of the first.
+    """Sum of the informations of several experiments with one brake, at the parameters of the first.
 
-    Those that were evaluated at their own running estimates are evaluated again there. Unknowns that each record has
-    of its own are eliminated from each before. A prior counts once.
+    Evaluations at running estimates are repeated at these parameters. Unknowns of single experiments are eliminated
+    before the sum. A prior counts once.
 
     Raises:
-        UsageError: they are of other parameters, models or unknowns, or about what each record has of its own.
+        UsageError: the parameters, models or unknowns differ, or a parameter of interest belongs to one experiment.
     """
     first, names = parts[0], parts[0].params
-    if own := [name for name in first.question.params if name in OF_AN_EXPERIMENT]:
-        raise UsageError(f"each run has its own {own[0]}: expected it as a nuisance of several runs")
+    if local := [name for name in first.question.params if name in OF_AN_EXPERIMENT]:
+        raise UsageError(f"each run has its own {local[0]}: expected it as a nuisance of several runs")
     parts = [
         evaluate(p.log, p.experiment, p.bench, [p.plant], p.question, LOG, first.theta, p.errors)[0]
         if isinstance(p, Evaluation) and p.theta_name == LOG
@@ -327,7 +327,7 @@ def expected(
 
 
 def _placed(theta: BrakeParameters, errors: SystematicErrors, experiment: Experiment, plant: Plant) -> Theta:
-    """All that the motion depends on, with the start of an experiment."""
+    """Parameters, errors and the start of an experiment."""
     at = Theta(theta, errors=errors)
     return at._replace(start=experiment.x0(at.offset(plant)))
 
@@ -342,10 +342,7 @@ def evaluate(
     theta: BrakeParameters,
     errors: SystematicErrors = NO_ERRORS,
 ) -> list[Evaluation]:
-    """Compute both Fisher informations over time, and how well each model fits.
-
-    They are those at ``theta``, with the systematic errors of the bench there.
-    """
+    """Both Fisher informations over time at ``theta`` and ``errors``, and the fit, of each model."""
     instants = evenly(experiment.periods, INSTANTS)
     found = []
     for plant in plants:
@@ -378,10 +375,7 @@ def default_model(log: RunLog) -> tuple[str, str]:
 
 
 def check_sample_time(log: RunLog, bench: Bench) -> None:
-    """Refuse a log whose own bench file states another sample time than a bench.
-
-    A log without a readable bench file is taken to be on this bench's grid.
-    """
+    """Refuse a log with another sample time in its bench file; one without a readable bench file passes."""
     with suppress(LogError):
         if (its := log.bench.timing.sample_time) != (ours := bench.timing.sample_time):
             raise UsageError(f"{log.path}: expected a sample time of {ours:g} s, as in the bench file, got {its:g} s")

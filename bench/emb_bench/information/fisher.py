@@ -1,10 +1,11 @@
-"""Fisher information that a sequence of currents draws from a brake.
+"""Fisher information of a sequence of currents about a brake.
 
-Two of them live here and are never mixed:
+There are two kinds, which are never mixed:
 
-- ``physical``: S^T R⁻¹ S with S and R in the same units. The only one with a Cramér-Rao bound.
-- ``weighted``: the thesis's (eq. 4.18-4.21, 5.12): outputs divided by 100 rad and 500 rad/s, R left as it is. A reward,
-  and comparable with the thesis.
+- ``physical``: S^T R⁻¹ S with S and R in the same units. Only this kind has a Cramér-Rao bound.
+- ``weighted``: the thesis's (eq. 4.18-4.21, 5.12), with outputs divided by 100 rad and 500 rad/s, and R unchanged. It
+is a
+  reward, comparable with the thesis.
 
 Parameters are relative to their values θ (eq. 4.17). Unknowns that are not the brake's parameters have units
 (:data:`emb_bench.brake.parameters.UNITS`). Everything here is numpy and plain Python and runs on the base install.
@@ -21,7 +22,7 @@ import numpy as np
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Instruments
 from emb_bench.information.criteria import Criteria, criteria
-from emb_bench.information.identifiability import Identifiability, Spectrum, judge
+from emb_bench.information.identifiability import Identifiability, Spectrum, identifiability
 from emb_bench.information.symmetric import Floats, pack, unpack, upper
 from emb_bench.sim.open_loop import check_unknowns
 from emb_runtime.config.bench import BrakeParameters, Limits, Noise, Ranges
@@ -54,12 +55,12 @@ def weights_of(bench: Bench, kind: Kind) -> Weights:
 
 
 def weights_along(bench: Bench, kind: Kind, instruments: Instruments, states: Floats) -> Floats:
-    """The weights of each sample of a run, with what the instruments take away.
+    """The weights of each sample of a run, with the effects of the instruments.
 
     An error σ_t of the instant of sampling adds to the variance of an output what the output changes in that time:
     R_eff = σ² + (ẏ σ_t)², where the velocity is that of the sample and the acceleration the mean of the period before.
-    A velocity that an observer derives from the measured angles adds no information to them: it does not count.
-    Instruments concern the physical information; the weighted one is the thesis's, whatever measured.
+    A velocity that an observer derives from the angles has no information besides theirs: its weight is zero. The
+    weighted information is the thesis's, without effects of the instruments.
 
     The states are those at all n + 1 instants; the weights, shape (n, 2), have the units of :class:`Weights`.
     """
@@ -80,10 +81,10 @@ def information_over_time(s: Floats, weights: Weights | Floats, start: Any = Non
         s: sensitivities, shape (n, p, 2).
         weights: of all samples, or those of each one, shape (n, 2), from :func:`weights_along`.
         start: FIM before the first sample, shape (p, p): a prior or the thesis's ε I; zero without (eq. 4.27).
-        measured: n booleans, False for a sample that was lost: the brake moved on unobserved.
+        measured: n booleans, False for a lost sample.
 
     Returns:
-        Shape (n, p, p); the last one is the FIM of the whole sequence.
+        Shape (n, p, p); the last one is the FIM of the sequence.
     """
     count, size, _ = s.shape
     each = np.broadcast_to(np.asarray(weights, dtype=np.float64), (count, 2))
@@ -98,16 +99,15 @@ def information_over_time(s: Floats, weights: Weights | Floats, start: Any = Non
 
 
 def information_of_range(low: Any, high: Any) -> Any:
-    """Information of knowing a range: 1/variance of the uniform distribution on it, 12/(high - low)²."""
+    """Information of a prior range: 1/variance of the uniform distribution on it, 12/(high - low)²."""
     return 12.0 / (high - low) ** 2
 
 
 def uniform_prior(ranges: Ranges, params: Sequence[str], reference: BrakeParameters) -> Floats:
-    """The FIM that knowing the ranges is worth (:func:`information_of_range`), relative to ``reference``.
+    """FIM of a prior range (:func:`information_of_range`), relative to ``reference``: 12 for ±50 %.
 
-    Unlike ε I it has a meaning: log |M| starts at what is known beforehand. It stands for a Gaussian prior of the same
-    variance (a uniform one has no Fisher information of its own), so that it is an approximation, not a bound.
-    ±50 % are worth 12.
+    It is that of a Gaussian prior of the same variance, an approximation and no bound: a uniform prior has no Fisher
+    information.
 
     Returns:
         Diagonal, shape (len(params), len(params)).
@@ -132,11 +132,11 @@ class Fisher:
     matrix: Floats  # Shape (len(params), len(params)), prior included; dimensionless if physical
     prior: Floats | None  # Prior information in ``matrix``, of the same shape; None without a prior
     plant: str  # Name of that brake's plant in the bench
-    nuisances: tuple[str, ...] = ()  # Those of ``params`` that are unknown too, but of no interest
+    nuisances: tuple[str, ...] = ()  # Those of ``params`` that are not of interest
 
     @property
     def interest(self) -> tuple[str, ...]:
-        """The parameters that the experiment is for."""
+        """The parameters of interest."""
         return tuple(name for name in self.params if name not in self.nuisances)
 
     def criteria(self) -> Criteria:
@@ -144,10 +144,10 @@ class Fisher:
         return criteria(self.matrix, self.params, self.interest)
 
     def cramer_rao(self) -> dict[str, float]:
-        """Least standard deviation of an unbiased estimate of each unknown when all the others are unknown too.
+        """Cramér-Rao bound on the standard deviation of each unknown, with all others unknown.
 
-        Relative, or in the unknown's unit; inf if the data do not identify it. With a
-        prior it is the spread after a Gaussian one of the same variance, to first order, and no bound.
+        Relative, or in the unknown's unit; inf if the data do not identify it. With a prior it is the posterior
+        deviation for a Gaussian prior of the same variance, to first order, and no bound.
         """
         deviations = np.sqrt(np.diag(self.covariance()))
         return dict(zip(self.params, deviations.tolist(), strict=True))
@@ -162,10 +162,10 @@ class Fisher:
         self._physical()
         return Spectrum(self.matrix).correlation()
 
-    def verdict(self, ranges: Ranges | None = None) -> Identifiability:
-        """Identifiability of each parameter, with ``ranges`` in which it is known to lie."""
+    def identifiability(self, ranges: Ranges | None = None) -> Identifiability:
+        """Identifiability of each parameter, with prior ``ranges`` of its value."""
         self._physical()
-        return judge(self.matrix, self.params, self.prior, _borders(self.params, self.theta, ranges))
+        return identifiability(self.matrix, self.params, self.prior, _borders(self.params, self.theta, ranges))
 
     def _physical(self) -> None:
         if self.kind != "physical":
@@ -182,6 +182,6 @@ def _borders(params: Sequence[str], theta: BrakeParameters, ranges: Ranges | Non
     for name in params:
         low, high = getattr(ranges.low, name, 0.0), getattr(ranges.high, name, 0.0)
         if low < high:
-            own = getattr(theta, name)
-            found[name] = (own - low) / own, (high - own) / own
+            value = getattr(theta, name)
+            found[name] = (value - low) / value, (high - value) / value
     return found

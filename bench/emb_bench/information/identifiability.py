@@ -1,15 +1,14 @@
 """Identifiability of each parameter, and of combinations of them, from a Fisher information matrix.
 
-**What counts as singular.** The matrix is scaled to a unit diagonal, C = D^−½ M D^−½, so that units do not matter. An
-eigenvalue of C below 1e-14 times its size is what rounding leaves of zero. Errors of the sensitivities enter squared:
-those of the exact brake, about 1e-9 of the sensitivity, would have to grow a hundredfold to lift an eigenvalue that is
-zero above that, and one that is not zero and not below it stands for a direction whose trace they do not make up.
+**Singular.** The matrix is scaled to a unit diagonal, C = D^−½ M D^−½, so that units do not matter. An eigenvalue of C
+below 1e-14 times its size is zero to rounding. Relative errors of the sensitivities enter squared: those of the exact
+brake, about 1e-9, change C by 1e-18. So a larger eigenvalue is that of a direction that changes the data.
 
-**What counts as not identified.** A bound can be finite and worthless. A parameter is identified if the least standard
-deviation of its estimate is below 100 % of its value, or below the gross error of one with a unit. Beyond
-that not even its order of magnitude follows from the data, and the linearisation that the bound rests on does not hold.
+**Not identified.** A finite bound may be useless. A parameter is identified if the least standard deviation of its
+estimate is below 100 % of its value, or below the gross error of one with a unit. Beyond it the data do not determine
+the order of magnitude, and the linearisation of the bound does not hold.
 
-A singular matrix has the worst values there are and a verdict, never a NaN.
+A singular matrix has the worst values and a finding for each parameter, never a NaN.
 """
 
 from __future__ import annotations
@@ -27,19 +26,19 @@ from emb_bench.config.machine import Machine
 from emb_bench.information.symmetric import SINGULAR, Floats
 from emb_runtime.errors import UsageError
 
-TRADED_OFF = 0.95  # Correlation from which on two estimates are traded off against each other
+TRADED_OFF = 0.95  # Correlation above which two parameters trade off
 GROSS: Mapping[str, float] = {name: row.gross for name, row in PARAMETERS.items()}
-"""Error at which an unknown is of no use: of its value, or in its unit."""
-NEWS = 0.9  # Share of the deviation known beforehand above which the data have added nothing
+"""Error above which an unknown is not identified: relative, or in its unit."""
+NEWS = 0.9  # Ratio to the prior deviation above which the data have added nothing
 
-TOUCHED = 1e-6  # share of a flat direction from which on a parameter belongs to it
+TOUCHED = 1e-6  # share of a flat direction above which a parameter belongs to it
 _ROUNDING = 1e-14  # of an eigenvector, times the distance of its eigenvalue from the others
 
 
 class Spectrum:
-    """Eigenvalues of M scaled to a unit diagonal: as accurate as M allows whatever its scales are.
+    """Eigenvalues of M scaled to a unit diagonal, accurate for parameters of any scale.
 
-    Parameters without any information are kept apart, so that a flat direction is a combination of the others.
+    Parameters without any information are separate: a flat direction is a combination of the others.
     """
 
     def __init__(self, matrix: Any) -> None:
@@ -54,15 +53,15 @@ class Spectrum:
         keep = values > SINGULAR * len(m)
         everywhere = np.zeros((len(m), len(values)))
         everywhere[~self.dead] = vectors
-        self._values, self._kept = values[keep], everywhere[:, keep]
+        self._values, self._vectors = values[keep], everywhere[:, keep]
         self._flat = everywhere[:, ~keep].T if keep.all() else self._parted(everywhere[:, ~keep].T)
         self.lost = self.dead | (self._flat != 0.0).any(axis=0)
         self.singular = bool(self.lost.any())
 
     def _parted(self, rows: Floats) -> Floats:
-        """A basis of the flat combinations, without the parameters that do not belong to them."""
+        """A basis of the flat combinations, with zeros for parameters that do not belong to them."""
         flat = _echelon(rows)
-        # A share counts if it is large in the scaled matrix, or among parameters and more than rounding in the matrix.
+        # A share counts if it is large in the scaled matrix, or large in the parameters and above rounding.
         shares = np.abs(flat / self._unit)
         large = shares > TOUCHED * np.linalg.norm(shares, axis=1, keepdims=True)
         touched = large & (np.abs(flat) > _ROUNDING / min(self._values, default=1.0)) | (np.abs(flat) > TOUCHED)
@@ -76,7 +75,7 @@ class Spectrum:
 
     def inverse(self) -> Floats:
         """M⁻¹; where M is singular, the pseudo-inverse with inf on the diagonal of each unidentified parameter."""
-        inverse: Floats = (self._kept / self._values) @ self._kept.T / np.outer(self._unit, self._unit)
+        inverse: Floats = (self._vectors / self._values) @ self._vectors.T / np.outer(self._unit, self._unit)
         inverse[self.lost, self.lost] = math.inf
         return inverse
 
@@ -99,7 +98,7 @@ class Spectrum:
         Between parameters that the data do not identify it is the limit for a prior that vanishes: that of the
         flat directions they share, and 0 where they share none.
         """
-        covariance = (self._kept / self._values) @ self._kept.T
+        covariance = (self._vectors / self._values) @ self._vectors.T
         flat = self._flat.T @ np.linalg.pinv(self._flat.T)
         both = np.outer(self.lost, self.lost)
         covariance = np.where(both, flat, np.where(self.lost[:, None] | self.lost, 0.0, covariance))
@@ -112,7 +111,7 @@ class Spectrum:
 def _echelon(rows: Floats) -> Floats:
     """Echelon basis of the same row space: each row has a one where all the others have a zero.
 
-    Of two flat directions without a parameter in common an eigenvalue routine returns any mixture; this parts them.
+    It separates flat directions without a common parameter, of which an eigenvalue routine returns any mixture.
     """
     result, used = rows.copy(), set[int]()
     for i in range(len(result)):
@@ -135,14 +134,14 @@ def unit_vector(v: Floats) -> Floats:
 
 
 def combination(direction: Mapping[str, float]) -> str:
-    """A direction as a sum, without what does not belong to it."""
+    """A direction as a sum of its parameters."""
     return " ".join(f"{share:+.3g} {name}" for name, share in direction.items() if abs(share) > TOUCHED)
 
 
 def schur_complement(matrix: Any, index: Sequence[int]) -> Floats:
-    """Information on some parameters when the others are unknown too: M_aa − M_ab M_bb⁻¹ M_ba.
+    """Information on some parameters with the others as nuisances: M_aa − M_ab M_bb⁻¹ M_ba.
 
-    Nuisances that the data do not identify cost no more than those that they do.
+    By the pseudo-inverse: nuisances may be unidentified.
     """
     m = np.asarray(matrix, dtype=np.float64)
     others = [i for i in range(len(m)) if i not in index]
@@ -152,20 +151,20 @@ def schur_complement(matrix: Any, index: Sequence[int]) -> Floats:
     scaled = m / np.outer(unit, unit)
     cross = scaled[np.ix_(index, others)]
     inner = np.linalg.pinv(scaled[np.ix_(others, others)], rcond=SINGULAR * len(m), hermitian=True)
-    kept = unit[list(index)]
-    result: Floats = (scaled[np.ix_(index, index)] - cross @ inner @ cross.T) * np.outer(kept, kept)
+    of_index = unit[list(index)]
+    result: Floats = (scaled[np.ix_(index, index)] - cross @ inner @ cross.T) * np.outer(of_index, of_index)
     return result
 
 
 class Doubt(StrEnum):
-    """Reason that a parameter is not identified: by the information, or by what an estimate adds to it."""
+    """Reason that a parameter is not identified, by the information or by the estimate."""
 
     NO_INFORMATION = "no_information"
-    ONLY_COMBINED = "only_combined"  # With other parameters
-    NOTHING_NEW = "nothing_new"  # To what was known before
-    TOO_WIDE = "too_wide"  # The deviation is no smaller than the value or a gross error
-    FLAT = "flat"  # Its likelihood profile is, or is open at one end
-    OPEN_BELOW = "open_below"
+    ONLY_COMBINED = "only_combined"  # Only a combination with others is identified
+    NOTHING_NEW = "nothing_new"  # Beyond the prior
+    TOO_WIDE = "too_wide"  # The deviation is at least the value or the gross error
+    FLAT = "flat"  # The likelihood profile is open at both ends
+    OPEN_BELOW = "open_below"  # At one end
     OPEN_ABOVE = "open_above"
     CUT = "cut"  # The profile ends where another parameter is at the border of its search
     AT_BORDER = "at_border"  # Of the search
@@ -173,7 +172,7 @@ class Doubt(StrEnum):
 
 
 class Border(StrEnum):
-    """Place of a value that is not well inside its range."""
+    """Place of a value outside of its range or near its end."""
 
     BELOW = "below"
     AT_LOWER = "at_lower"  # Within a deviation of the lower end
@@ -201,10 +200,10 @@ class Finding:
 
 @dataclass(frozen=True)
 class Direction:
-    """A combination of parameters that can change with little or no trace in the data."""
+    """A combination of parameters that changes the data little or not at all."""
 
     shares: Mapping[str, float]  # Unit vector, in relative parameters and in the units of the others
-    deviation: float  # Least standard deviation along it; inf if it leaves no trace at all
+    deviation: float  # Least standard deviation along it; inf if the data do not change
 
 
 @dataclass(frozen=True)
@@ -220,8 +219,8 @@ class Identifiability:
         """Returns True if all parameters are identified."""
         return all(finding.identified for finding in self.findings)
 
-    def shown(self, machine: Machine | None) -> Identifiability:
-        """Findings by the names and in the units of a machine."""
+    def renamed(self, machine: Machine | None) -> Identifiability:
+        """Findings with the names and units of a machine."""
         findings = []
         for finding in self.findings:
             name, unit = quantity(machine, finding.name)
@@ -233,15 +232,15 @@ class Identifiability:
         return Identifiability(tuple(findings), directions, tuple(renamed(s, machine) for s in self.left_to_prior))
 
 
-def judge(
+def identifiability(
     matrix: Any, params: Sequence[str], prior: Any = None, borders: Mapping[str, tuple[float, float]] | None = None
 ) -> Identifiability:
-    """Judges from a physical FIM which parameters the data identify.
+    """Identifiability of each parameter from a physical FIM.
 
     Args:
         matrix: FIM with the prior in it, shape (len(params), len(params)), relative parameters.
-        params: what to call its rows.
-        prior: the part of it that was known beforehand.
+        params: names of its rows.
+        prior: FIM of the prior, a part of ``matrix``.
         borders: distance of a parameter's value to the lower and to the upper border of its range, in the same
             relative units, negative if it lies outside.
     """
@@ -278,16 +277,16 @@ def judge(
 
 
 def _left_to_prior(spectrum: Spectrum, params: Sequence[str], prior: Any) -> tuple[Mapping[str, float], ...]:
-    """Flat directions of the data alone, without those that the prior does not identify either."""
+    """Directions that are flat in the data alone and not in the prior."""
     if prior is None:
         return ()
-    known = np.asarray(prior, dtype=np.float64)
-    data = spectrum.matrix - known
+    before = np.asarray(prior, dtype=np.float64)
+    data = spectrum.matrix - before
     dead = np.diag(data) <= SINGULAR * np.diag(spectrum.matrix)  # a difference of equals is rounding
     data[dead, :] = 0.0
     data[:, dead] = 0.0
     flat = Spectrum(data).flat_directions()
-    return tuple(dict(zip(params, v.tolist(), strict=True)) for v in flat if v @ known @ v > 0.0)
+    return tuple(dict(zip(params, v.tolist(), strict=True)) for v in flat if v @ before @ v > 0.0)
 
 
 def _border(deviation: float, distances: tuple[float, float] | None) -> Border | None:
@@ -307,16 +306,16 @@ def _unidentified(spectrum: Spectrum, params: Sequence[str]) -> list[Direction]:
         for v in spectrum.flat_directions()
         if np.count_nonzero(np.abs(v) > TOUCHED) > 1
     ]
-    known = np.flatnonzero(~spectrum.lost)
-    gross = np.array([GROSS.get(params[int(i)], 1.0) for i in known])
-    if not len(known):
+    index = np.flatnonzero(~spectrum.lost)
+    gross = np.array([GROSS.get(params[int(i)], 1.0) for i in index])
+    if not len(index):
         return found
-    variances, vectors = np.linalg.eigh(spectrum.inverse()[np.ix_(known, known)] / np.outer(gross, gross))
+    variances, vectors = np.linalg.eigh(spectrum.inverse()[np.ix_(index, index)] / np.outer(gross, gross))
     for variance, vector in zip(variances[::-1], vectors.T[::-1], strict=True):
         if variance < 1.0:
             break
         along = np.zeros(len(params))
-        along[known] = gross * vector
+        along[index] = gross * vector
         length = float(np.linalg.norm(along))
         found.append(
             Direction(dict(zip(params, unit_vector(along).tolist(), strict=True)), length * math.sqrt(variance))

@@ -4,9 +4,9 @@ A symmetric n×n matrix is a vector of n (n + 1) / 2 numbers, the rows of its up
 is the order of ``numpy.triu_indices(n)``. The functions take arrays that the caller owns, call no numpy, and run as
 plain Python or compiled (:mod:`emb_bench.compiled`) alike. They are meant for n ≤ 4.
 
-All answers come from a Cholesky factor, never from a determinant expanded or eliminated in floating point: that is
-what turns negative for a nearly singular matrix (thesis Fig. 4.2). A matrix that is singular to rounding, or holds a
-NaN, gets the worst value there is (log det −inf, λ_min 0, tr M⁻¹ inf), never a NaN.
+All values follow from a Cholesky factor. A determinant by expansion or elimination can be negative for a nearly
+singular matrix (thesis Fig. 4.2). A matrix that is singular to rounding, or contains a NaN, gets the worst value (log
+det −inf, λ_min 0, tr M⁻¹ inf), never a NaN.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from emb_bench.compiled import compiled
 Floats = NDArray[np.float64]
 
 SINGULAR = 1e-14
-"""A pivot below this share of its diagonal element is what rounding leaves of zero after some hundred increments."""
+"""A pivot below this share of its diagonal element is zero to the rounding of some hundred increments."""
 
 LOG_DET, LAMBDA_MIN, LOG_LAMBDA_MIN, MINUS_LOG_TRACE = range(4)
 """Criteria: ln |M| (D), λ_min and ln λ_min (E), −ln tr M⁻¹ (A); :func:`phi` has all but λ_min itself."""
@@ -99,7 +99,7 @@ def trace_inverse(m: Floats, work: Floats) -> float:
         return math.inf
     n = work.shape[0]
     total = 0.0
-    for j in range(n):  # column j of U⁻¹ by back substitution, kept below the diagonal of work as row j
+    for j in range(n):  # column j of U⁻¹ by back substitution, stored below the diagonal of work as row j
         inverse = 1.0 / work[j, j]
         total += inverse * inverse
         for i in range(j - 1, -1, -1):
@@ -242,7 +242,7 @@ def pack(matrix: Any) -> Floats:
 
 
 def unpack(m: Any, n: int) -> Floats:
-    """The symmetric n×n matrix of a packed one; leading axes are kept: (..., n (n + 1) / 2) to (..., n, n)."""
+    """The symmetric n×n matrix of a packed one; leading axes stay: (..., n (n + 1) / 2) to (..., n, n)."""
     packed = np.asarray(m, dtype=np.float64)
     rows, columns = upper(n)
     square = np.empty((*packed.shape[:-1], n, n))

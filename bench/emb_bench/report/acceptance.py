@@ -19,7 +19,7 @@ from xml.etree import ElementTree
 import msgspec
 
 from emb_bench.analysis.drift import Drift
-from emb_bench.analysis.study import Code, Result, Run, Study, verdict
+from emb_bench.analysis.study import Code, Result, StudiedRun, Study, verdict
 from emb_bench.brake.parameters import OF_AN_EXPERIMENT, PARAMETERS, SI, UNITS
 from emb_bench.estimate.records import DONE, NORMAL_95
 from emb_bench.numbers import amount, share, share_between
@@ -182,7 +182,7 @@ def _doubt(study: Study) -> str:
     }.get(verdict(study).model, "")
 
 
-def _completed(run: Run, several: bool) -> Criterion:
+def _completed(run: StudiedRun, several: bool) -> Criterion:
     name, log = f"completed, {run.name}" if several else "run completed", run.log
     required = "ran to its planned end, log complete"
     if (reason := log.exit_reason) != DONE:

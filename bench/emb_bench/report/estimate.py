@@ -87,8 +87,8 @@ def _limits(study: Study) -> Iterator[str]:
     """Effects that limit the intervals, and effects that the residuals hint at."""
     e = study.estimate
     by: dict[str, list[str]] = {}
-    for i in e.wanted():
-        if (suspect := e.left_open_by(i)) is not None and e.open()[i] > e.cramer_rao()[i]:
+    for i in e.requested():
+        if (suspect := e.largest_bias(i)) is not None and e.unmodelled_bias()[i] > e.cramer_rao()[i]:
             by.setdefault(say.limit(suspect, e), []).append(e.labels[i])
     if by:
         more = [SCALE] if any(name.startswith("J, known to") for name in by) else []
@@ -139,7 +139,7 @@ def _evidence(study: Study) -> Iterator[str]:
     for table in found:
         yield from [] if table is None else table.text("  ")
     yield from listed("NOTE: ", [say.pairs(pairs) if pairs else "", say.once(study)])
-    yield from listed("", directions(e.verdict()))
+    yield from listed("", directions(e.identifiability()))
     yield from listed("", (f"profile of {p.label}: {say.profile(p, e)}" for p in study.checks.profiles))
 
 
@@ -147,7 +147,7 @@ def document(study: Study) -> dict[str, Any]:
     """Everything about a study; numbers may be infinite."""
     e, checks = study.estimate, study.checks
     choice = checks.choice
-    wanted, validation = e.wanted(), e.validation
+    wanted, validation = e.requested(), e.validation
     found = {
         "simulated": any(log.simulated for log in study.logs),
         "method": METHODS[e.method],
@@ -157,10 +157,10 @@ def document(study: Study) -> dict[str, Any]:
             {"name": log.path, "periods": len(r.currents), "measured": r.measured.sum()}
             for log, r in zip(study.logs, e.experiments, strict=True)
         ],
-        "params": e.asked.params,
-        "nuisances": e.asked.nuisances,
+        "params": e.question.params,
+        "nuisances": e.question.nuisances,
         "systematic": _systematic(e),
-        "prior": e.asked.prior.name if e.asked.prior else None,
+        "prior": e.question.prior.name if e.question.prior else None,
         "misfit": {
             **to_json(validation),
             "chi2_per_freedom": validation.ratio,
@@ -178,14 +178,14 @@ def document(study: Study) -> dict[str, Any]:
             if choice is not None
         ],
         "models_left_out": choice.same if choice is not None else (),
-        "not_told_apart": [c.name for c in choice.left_over] if choice and len(choice.left_over) > 1 else None,
+        "not_told_apart": [c.name for c in choice.plausible] if choice and len(choice.plausible) > 1 else None,
         "correlation": {
             "names": [e.labels[i] for i in wanted],
             "matrix": e.correlation()[np.ix_(wanted, wanted)],
         },
         "information": schur_complement(e.information, wanted),
-        "directions": e.verdict().directions,
-        "left_to_prior": e.verdict().left_to_prior,
+        "directions": e.identifiability().directions,
+        "left_to_prior": e.identifiability().left_to_prior,
         "profiles": [
             _fields(p, "label", "values", "rise", "doubt") | {"interval_95": p.interval} for p in checks.profiles
         ],
@@ -227,19 +227,19 @@ def _shown(e: Estimate, z: Floats) -> dict[str, float]:
 def _systematic(e: Estimate) -> dict[str, Any]:
     """Systematic errors that were estimated with the parameters."""
     return {
-        label: {"value": value, "deviation": deviation, "deviation_before": e.asked.systematic[unknown.name]}
+        label: {"value": value, "deviation": deviation, "deviation_before": e.question.systematic[unknown.name]}
         for unknown, label, value, deviation in zip(e.unknowns, e.labels, e.values, e.deviations(), strict=True)
-        if unknown.name in e.asked.systematic
+        if unknown.name in e.question.systematic
     }
 
 
 def _parameters(study: Study) -> dict[str, dict[str, Any]]:
     e, found = study.estimate, {}
-    columns = (e.deviations(), e.cramer_rao(), e.robust(), e.open())
-    for i, c in zip(e.wanted(), study.conclusions, strict=True):
+    columns = (e.deviations(), e.cramer_rao(), e.robust(), e.unmodelled_bias())
+    for i, c in zip(e.requested(), study.conclusions, strict=True):
         unknown = e.unknowns[i]
         used, bound, robust, model = (column[i] for column in columns)
-        suspect = e.left_open_by(i)
+        suspect = e.largest_bias(i)
         found[c.label] = {
             **_fields(c, "value", "unit", "repeatability", "identified", "standing", "outside"),
             **_fields(c.finding, "doubts", "traded_with"),

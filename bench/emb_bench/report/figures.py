@@ -222,7 +222,7 @@ def axis_unit(e: Estimate, i: int, farthest: float) -> tuple[float, str]:
     With them the ``farthest`` has no power of ten.
     """
     if not e.unknowns[i].relative:
-        unit, power = e.shown[i].unit, math.floor(math.log10(farthest)) if farthest > 0.0 else 0
+        unit, power = e.quantities[i].unit, math.floor(math.log10(farthest)) if farthest > 0.0 else 0
         if power > -3:
             return 1.0, unit
         return 10.0**-power, f"10{str(power).translate(SUPERSCRIPT)} {unit.removesuffix('1')}".rstrip()

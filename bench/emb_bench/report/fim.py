@@ -36,7 +36,7 @@ CRITERIA = {
 
 def document(e: Evaluation) -> dict[str, Any]:
     """Everything about the information, for ``--json``; a number that is not finite becomes null."""
-    x, question, fisher, verdict = e.experiment, e.question, e.fisher("physical"), e.verdict()
+    x, question, fisher, verdict = e.experiment, e.question, e.fisher("physical"), e.identifiability()
     times = (np.array(e.instants) + 1) * e.bench.timing.sample_time
     numbers = ("log_det", "lambda_min", "trace_inverse", "condition", "singular")
     found: dict[str, Any] = {
@@ -106,7 +106,7 @@ def text(e: Evaluation, *, verbose: bool = False) -> str:
     lines += [*facts(("model", f"{e.plant.name} ({_why(e)})"), ("residuals", fit)), *_unknowns(e.question)]
     if not e.fisher("weighted").matrix.any():  # which has no prior
         return "\n".join([*doubts, "no information: the record does not depend on any of these parameters", *lines])
-    verdict = e.verdict().shown(e.bench.machine)
+    verdict = e.identifiability().renamed(e.bench.machine)
     prior = "" if e.question.prior is None else ", with the prior"
     head = [*_expected(e, prior), *wrapped(f"smallest possible repeatability ± 95 % (k=2){prior}, of ideal sensors")]
     rows = [[f.name, _half(f.deviation, f.unit), say.finding(f)] for f in verdict.findings]
@@ -115,7 +115,7 @@ def text(e: Evaluation, *, verbose: bool = False) -> str:
         bounds = {f.name: NORMAL_95 * f.deviation for f in verdict.findings if f.name in PARAMETER_NAMES}
         head += listed("  ", [total(bounds, e.bench.systematic)])
     head += listed("  ", say.directions(verdict))
-    final = e.fisher("physical").criteria().shown(e.bench.machine)
+    final = e.fisher("physical").criteria().renamed(e.bench.machine)
     smallest, condition = plain(final.lambda_min), plain(final.condition)
     shown = f"log det {final.log_det:.5g}, smallest eigenvalue {smallest}, condition {condition}"
     lines = [*head, "", *lines, *facts(("information", shown))]
@@ -154,7 +154,7 @@ def _half(deviation: float, unit: str) -> str:
 
 def _details(e: Evaluation) -> list[str]:
     """Criteria of both informations, and how they grew."""
-    final = {kind: e.fisher(kind).criteria().shown(e.bench.machine) for kind in KINDS}
+    final = {kind: e.fisher(kind).criteria().renamed(e.bench.machine) for kind in KINDS}
     rows = [[label, *(plain(getattr(final[kind], name), 6) for kind in KINDS)] for label, name in CRITERIA.items()]
     table = Table("", ("Fisher information", *KINDS), rows).lines()
     weakest = f"least determined: {combination(final['physical'].weakest)}"

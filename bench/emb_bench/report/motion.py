@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.analysis.study import Run, Study
+from emb_bench.analysis.study import StudiedRun, Study
 from emb_bench.config.bench import Bench
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.logs import timing
@@ -32,7 +32,7 @@ REASONS = {
 class Motion:
     """Motion of the brake in a run, and what drove it."""
 
-    run: Run
+    run: StudiedRun
     bench: Bench
     cycles: ActiveCycles | None  # None if the log has no control cycles, as a recording of others
     after: StopSamples | None  # None if the run was not stopped, or its log has no later samples
@@ -47,7 +47,7 @@ class Motion:
         return self.run.experiment
 
     @classmethod
-    def of(cls, run: Run, bench: Bench, study: Study | None = None) -> Self:
+    def of(cls, run: StudiedRun, bench: Bench, study: Study | None = None) -> Self:
         """The motion of a run; with a study, the prediction of its estimate, too."""
         try:
             cycles: ActiveCycles | None = ActiveCycles(run.log, bench)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from emb_bench.analysis.conclusion import Conclusion
-from emb_bench.analysis.study import Code, Run, Study, Verdict, verdict
+from emb_bench.analysis.study import Code, StudiedRun, Study, Verdict, verdict
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import QUANTILES, Bench
 from emb_bench.config.conditions import CONDITIONS
@@ -231,7 +231,7 @@ def _model(study: Study, found: Verdict) -> Iterator[Block]:
         yield Items(say.residual_notes(e), "warnings")
 
 
-def _end(run: Run) -> Words:
+def _end(run: StudiedRun) -> Words:
     """End of a run, its samples, and whether its log is whole."""
     log, x = run.log, run.experiment
     detail, samples = log.end.get("detail"), 0 if x is None else int(x.measured.sum())
@@ -242,7 +242,7 @@ def _end(run: Run) -> Words:
     return [end, f" ({detail})" if detail else "", f"; {said}", whole]
 
 
-def _runs(runs: Sequence[Run], found: Sequence[trend.Trend]) -> list[Block | None]:
+def _runs(runs: Sequence[StudiedRun], found: Sequence[trend.Trend]) -> list[Block | None]:
     """Each run by itself, and whether they agree."""
     agreed: list[Words] = []
     for one in found:
@@ -280,7 +280,7 @@ def _parameters(study: Study) -> list[Block | None]:
     e, found = study.estimate, verdict(study)
     note = say.intervals(e) if found.holds else f"{say.without(study)}."
     note += f" Method: {METHODS[e.method]}, model '{e.plant.name}' ({say.model_reason(study)})."
-    note += f" Known beforehand: {say.prior(e)}." if e.asked.prior else ""
+    note += f" Known beforehand: {say.prior(e)}." if e.question.prior else ""
     walks = say.random_walks(e.bench.machine, e.process_noise, e.load_noise)
     note += "".join(f" Disturbance: {walk}." for walk in walks)
     bias = "the method's bias" if found.biased else "the error of a wrong model"
@@ -493,7 +493,7 @@ def _events(motion: Motion) -> Table:
     return Table(f"Events of the safety chain, since {zero}", ["time [ms]", "event", "what"], rows, words=(1, 2))
 
 
-def _log(run: Run) -> Iterator[Block]:
+def _log(run: StudiedRun) -> Iterator[Block]:
     """The log's file, end, metadata and attachments."""
     log, x = run.log, run.experiment
     missing = [log.missing] if log.missing else []
@@ -559,7 +559,7 @@ def _tested(report: Report) -> tuple[Facts, Table | None]:
     return shared, Table(title, ["run", *names], rows, words=range(len(names) + 1))
 
 
-def _identity(run: Run, its: Bench) -> dict[str, str]:
+def _identity(run: StudiedRun, its: Bench) -> dict[str, str]:
     """Device, conditions, versions and hashes of one run."""
     entries, limits, noise = run.log.run, its.limits, its.noise
     name, digest = entries.get("bench_name", ""), entries.get("bench_hash", "")[:SHORT_HASH]
@@ -618,7 +618,7 @@ def document(report: Report) -> dict[str, Any]:
     return found
 
 
-def _run_document(run: Run, study: Study) -> dict[str, Any]:
+def _run_document(run: StudiedRun, study: Study) -> dict[str, Any]:
     found: dict[str, Any] = {
         "began": run.log.began,
         "simulated": bool(run.log.simulated),

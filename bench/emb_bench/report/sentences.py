@@ -64,7 +64,7 @@ def without(study: Study) -> str:
 
 def intervals(e: Estimate) -> str:
     """Sentence on the intervals of a model that holds."""
-    if not (e.asked.systematic or e.validation.budget):
+    if not (e.question.systematic or e.validation.budget):
         return NOISE_ALONE
     return INTERVALS.replace("systematic errors and ", "") if e.ideal_sensors else INTERVALS
 
@@ -100,7 +100,7 @@ def headline(study: Study) -> str:
     name, m = study.estimate.plant.name, study.estimate.validation
     size = f" (chi2/n {plain(m.ratio)}, at most {m.expected[1]:.3f} expected)" if "size" in m.alarming else ""
     missed = ", ".join(study.unidentified)
-    others = len(study.unidentified) < len(study.estimate.asked.params)
+    others = len(study.unidentified) < len(study.estimate.question.params)
     return {
         Code.BIASED_METHOD: f"NOT JUDGED: recursive least squares does not reproduce the record (chi2/n "
         f"{plain(m.ratio)}). Noise biases its values; the model is not tested. Use --method oem.",
@@ -215,7 +215,7 @@ def model_reason(study: Study) -> str:
 def models(study: Study) -> str:
     """Models that the experiments do not tell apart; empty if one is left."""
     choice = study.checks.choice
-    found: Sequence[Candidate] = choice.left_over if choice is not None else ()
+    found: Sequence[Candidate] = choice.plausible if choice is not None else ()
     if choice is None or len(found) < 2:
         return ""
     names = ", ".join(c.name for c in found[:-1])
@@ -231,7 +231,7 @@ def models(study: Study) -> str:
 def limit(effect: Contribution, e: Estimate) -> str:
     """Effect that limits an interval most, with the prior of one that all runs share."""
     name, shared = shown_as(effect, e.bench.machine).name, effect.name in OF_THE_BENCH
-    return f"{name}, known to {in_percent(e.asked.allowed[effect.name])}" if shared else name
+    return f"{name}, known to {in_percent(e.question.unmodelled[effect.name])}" if shared else name
 
 
 # ---- tests on the residuals ----
@@ -286,7 +286,7 @@ def _window(e: Estimate) -> str:
     machine, needed = e.bench.machine, FEWEST_WINDOWS * (len(e.unknowns) + 2)
     if machine is None or not 0 < e.windows < needed:
         return ""
-    longest = (e.asked.window or machine.window) * e.windows / (needed + 1)
+    longest = (e.question.window or machine.window) * e.windows / (needed + 1)
     return f" --window {math.floor(1e3 * longest) / 1e3:g}"
 
 
@@ -405,8 +405,8 @@ def clamping(study: Study) -> str:
     _, force, current, friction = found
     known, band = (in_percent(one.total / one.value) for one in (force, friction))
     return (
-        f"clamping    force known to {known}: {amount(*force.shown)} at {plain(found.angle)} rad, held by "
-        f"{amount(*current.shown)}; friction band ± {plain(friction.value)} N, known to {band}"
+        f"clamping    force known to {known}: {amount(*force.with_interval)} at {plain(found.angle)} rad, held by "
+        f"{amount(*current.with_interval)}; friction band ± {plain(friction.value)} N, known to {band}"
     )
 
 
@@ -437,7 +437,7 @@ def held_out(h: HeldOut) -> str:
 def profile(p: Profile, e: Estimate) -> str:
     """Interval of a likelihood profile beside that of the Fisher information; in the units that are shown."""
     (low, high), fisher = p.interval, p.fisher
-    shown = e.shown[e.labels.index(p.label)].unit
+    shown = e.quantities[e.labels.index(p.label)].unit
     unit = "" if shown == "1" else f" {shown}"
     if p.doubt is Doubt.CUT:
         said = DOUBTS[Doubt.CUT]
@@ -465,7 +465,7 @@ def profile(p: Profile, e: Estimate) -> str:
 
 def prior(e: Estimate) -> str:
     """Prior knowledge; empty without any."""
-    ranges = e.asked.prior
+    ranges = e.question.prior
     return "" if ranges is None else f"the ranges '{ranges.name}', as a Gaussian of their mean and variance"
 
 

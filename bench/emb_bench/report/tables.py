@@ -58,7 +58,7 @@ def parameters(study: Study, *, brief: bool = False) -> Table:
     header += [] if brief else ["from nominal"]
     header += ["simulated", "error in sigma"] if study.truth is not None and not brief else []
     rows = []
-    for i, c in zip(e.wanted(), study.conclusions, strict=True):
+    for i, c in zip(e.requested(), study.conclusions, strict=True):
         unknown = e.unknowns[i]
         size = c.value if unknown.relative else 0.0
         row: list[str] = [c.label, amount(c.value, c.interval, c.unit)]
@@ -78,7 +78,7 @@ def parameters(study: Study, *, brief: bool = False) -> Table:
 def _errors(study: Study) -> list[list[str]]:
     """Of each parameter the value that was simulated, and the error in standard deviations."""
     e, rows = study.estimate, []
-    for i, c in zip(e.wanted(), study.conclusions, strict=True):
+    for i, c in zip(e.requested(), study.conclusions, strict=True):
         unknown, true = e.unknowns[i], getattr(study.truth, e.unknowns[i].name, math.nan)
         scale = float(e.deviations()[i]) * (abs(c.value) if unknown.relative else 1.0)
         error = (c.value - true) / scale if math.isfinite(scale) else math.nan
@@ -118,19 +118,19 @@ def models(study: Study) -> Table | None:
 
 def budget(study: Study) -> Table | None:
     """Contributions to the uncertainty of each parameter; None where nothing but the noise is allowed for."""
-    if not (study.estimate.asked.systematic or study.estimate.validation.budget):
+    if not (study.estimate.question.systematic or study.estimate.validation.budget):
         return None
     e, rows = study.estimate, []
-    bound, other, every = e.cramer_rao(), e.open(OF_THE_BENCH), e.open()
+    bound, other, every = e.cramer_rao(), e.unmodelled_bias(OF_THE_BENCH), e.unmodelled_bias()
     columns = (bound, np.sqrt(np.maximum(every**2 - other**2, 0.0)), other, e.robust())
-    for i, c in zip(e.wanted(), study.conclusions, strict=True):
+    for i, c in zip(e.requested(), study.conclusions, strict=True):
         factor = NORMAL_95 * float(e.scale[i])
         jointly, shared, effects, residuals = (factor * float(column[i]) for column in columns)
         systematic = math.sqrt(max(jointly**2 - c.repeatability**2, 0.0)) if math.isfinite(jointly) else math.inf
         systematic = systematic if systematic > SMALL * jointly else 0.0  # what is left is rounding
         halves = [c.repeatability, systematic, shared, effects, 0.5 * (c.interval[1] - c.interval[0]), residuals]
         size = c.value if e.unknowns[i].relative else 0.0
-        largest = e.left_open_by(i)
+        largest = e.largest_bias(i)
         rows.append(
             [c.label, *(relative(half, size) for half in halves), NOTHING if largest is None else limit(largest, e)]
         )
@@ -163,7 +163,7 @@ def clamping(study: Study) -> Table | None:
     if found is None:
         return None
     names = {"force": found.force, "current that holds it": found.current, "friction band, ±": found.friction}
-    rows = [[name, amount(*one.shown), relative(one.total, one.value)] for name, one in names.items()]
+    rows = [[name, amount(*one.with_interval), relative(one.total, one.value)] for name, one in names.items()]
     title = (
         f"Clamping force at {plain(found.angle)} rad from contact. The friction band is by how much the force may "
         "differ from that of the current while the brake rests; ± is the total (95 %, k=2)"
@@ -193,9 +193,9 @@ def systematic(e: Estimate) -> Table | None:
     """Systematic errors that were estimated too, with the priors of the bench file."""
     rows = []
     for unknown, label, value, own in zip(e.unknowns, e.labels, e.values, e.deviations(), strict=True):
-        if unknown.name in e.asked.along and unknown.name in e.asked.systematic:
+        if unknown.name in e.question.default_nuisances and unknown.name in e.question.systematic:
             unit = UNITS[unknown.name].replace("1", "")
-            before = e.asked.systematic[unknown.name]
+            before = e.question.systematic[unknown.name]
             estimated = around(float(value), NORMAL_95 * float(own))
             rows.append([label, f"{estimated} {unit}".strip(), f"{plain(before)} {unit}".strip()])
     title = "Systematic errors, estimated with the parameters; ± is the total (95 %, k=2)"
@@ -234,7 +234,7 @@ def predicted(study: Study) -> Table | None:
 
 def correlation(e: Estimate) -> tuple[Table | None, list[str]]:
     """Correlations of the estimates, and the pairs that the records hardly separate; of what all records share."""
-    index = [i for i in e.shared() if i in e.wanted()]
+    index = [i for i in e.shared() if i in e.requested()]
     labels = [e.labels[i] for i in index]
     matrix = e.correlation()[np.ix_(index, index)].tolist()
     rows = [

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.analysis.several_runs import Constancy, constancy
-from emb_bench.analysis.study import Run, Study, verdict
+from emb_bench.analysis.study import StudiedRun, Study, verdict
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.records import DONE, NORMAL_95
 from emb_bench.figures import COLOURS, svg
@@ -40,7 +40,7 @@ class Trend:
     agreement: Constancy | None  # Test whether the usable runs measured one number; None for fewer than two
 
 
-def trends(runs: Sequence[Run]) -> list[Trend]:
+def trends(runs: Sequence[StudiedRun]) -> list[Trend]:
     """Trends of the parameters of interest."""
     studies = [run.alone for run in runs if run.alone is not None]
     return [_trend(studies, c.label) for c in studies[0].conclusions if c.of_interest]
@@ -102,7 +102,7 @@ def _draw(trend: Trend, axes: Any) -> None:
         axis.legend(ncols=2, loc="best", fontsize=7.5)
 
 
-def table(runs: Sequence[Run], found: Sequence[Trend]) -> Table:
+def table(runs: Sequence[StudiedRun], found: Sequence[Trend]) -> Table:
     """One row for each run, those without an estimate included."""
     rows, at = [], 0
     for n, run in enumerate(runs, 1):

@@ -66,7 +66,7 @@ def test_models_that_the_records_do_not_tell_apart_share_the_weight_and_the_inte
     """A brake that never touches the clamp has no stiffness, whatever its curve."""
     found = chosen(bench, "exact", -square(15, 1.0)[:100], ["exact", "cubic"])
     assert [c.weight for c in found.candidates] == pytest.approx([0.5, 0.5], abs=0.01)
-    assert len(found.left_over) == 2
+    assert len(found.plausible) == 2
     k_m = Unknown("k_m")
     low, high = found.interval(k_m)
     for c in found.candidates:
@@ -127,7 +127,7 @@ def test_two_models_that_a_record_cannot_tell_apart_are_named_in_one_sentence(
     assert document(found)["not_told_apart"] == ["play", "exact"]
     choice = found.checks.choice
     assert choice is not None
-    assert all(c.fits for c in choice.left_over)
+    assert all(c.fits for c in choice.plausible)
     sentence = models(found)
     assert sentence in " ".join(text(found).split())
     page = make(tmp_path / "a.html", log.path, "--model", EVERY, "--starts", "1")
@@ -159,7 +159,7 @@ def test_plants_are_compared_with_the_errors_that_the_bench_cannot_exclude(bench
     found = choose_model(bench, models, lambda _: [data], with_systematic(asked, bench, plant), starts=1, seed=0)
     assert found.best.name == "hysteresis"
     assert found.best.fits
-    assert "delay" not in {c.name: c for c in found.candidates}["lag"].estimate.asked.along
+    assert "delay" not in {c.name: c for c in found.candidates}["lag"].estimate.question.default_nuisances
     e = found.best.estimate
     assert e.values[e.labels.index("current_offset")] == pytest.approx(0.02, rel=0.2)
 

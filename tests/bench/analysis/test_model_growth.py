@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from emb_bench.analysis.model_growth import ADDITIONS, grow_model, wanted
+from emb_bench.analysis.model_growth import ADDITIONS, addition_scores, grow_model
 from emb_bench.config.bench import Bench
 from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.estimate import Estimate
@@ -48,7 +48,7 @@ def test_the_model_grows_to_the_brake_that_was_there_and_no_further(bench: Bench
 
 def test_under_the_right_model_the_scores_are_small(bench: Bench) -> None:
     data = record(bench, bench.plant("exact"), currents_of(bench, "chirp"), seed=5)
-    scores = wanted(fit(bench, "exact", [data], EstimationProblem()))
+    scores = addition_scores(fit(bench, "exact", [data], EstimationProblem()))
     assert set(scores) == set(ADDITIONS)
     assert max(scores.values()) < 3.5
 
@@ -71,7 +71,7 @@ def test_a_lag_leaves_no_delay_to_be_estimated_along(bench: Bench) -> None:
     asked = with_systematic(EstimationProblem(), bench, plant)
     e = grow_model(bench, plant, [data], asked, starts=1, seed=0)
     assert "lag of the current" in e.plant.name
-    assert "delay" not in e.asked.along
+    assert "delay" not in e.question.default_nuisances
 
 
 def test_a_plant_that_is_not_solved_exactly_cannot_grow(bench: Bench) -> None:

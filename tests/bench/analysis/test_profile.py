@@ -52,7 +52,7 @@ def test_the_rise_is_that_of_a_search_over_the_other_parameter(bench: Bench) -> 
     data = record(bench, bench.plant("exact"), currents_of(bench, "square:amplitude=3,period=0.05"))
     e = estimated(bench, [data], "T_c", "f_v")
     found = profile(e, "T_c")
-    problem = Problem(e.bench, e.plant, e.asked, e.experiments)
+    problem = Problem(e.bench, e.plant, e.question, e.experiments)
     z = e.z
     weights = problem.weights(z)
 

@@ -85,8 +85,8 @@ def case(bench: Bench, plant: str, current: float) -> Case:
     data = replace(data, currents=data.currents + current)
     exact = bench.plant("exact")
     problem = make_problem(bench, exact, [data], with_systematic(EstimationProblem(), bench, exact))
-    assert problem.asked.systematic == PRIORS
-    e = fit(bench, exact, [data], problem.asked)
+    assert problem.question.systematic == PRIORS
+    e = fit(bench, exact, [data], problem.question)
     return Case(problem, e, problem.jacobian(e.fit, problem.weights(e.fit)))
 
 

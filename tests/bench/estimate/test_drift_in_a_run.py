@@ -8,7 +8,7 @@ import pytest
 from emb_bench.brake.motion import Floats, advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench
-from emb_bench.estimate.effects import Linearised, Simulated, with_systematic
+from emb_bench.estimate.effects import Linearised, Simulation, with_systematic
 from emb_bench.estimate.records import SYSTEMATIC, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.report.sentences import explained
@@ -46,7 +46,7 @@ def test_its_column_is_the_finite_difference_of_a_brake_that_drifts(bench: Bench
     problem = problem_of(bench, PARAMETER_NAMES, record(bench, bench.plant("exact"), currents))
     z = problem.nominal()
     weights = problem.weights(z)
-    model = Linearised(problem, z, Simulated(problem, z, weights), 0, np.zeros((0, len(z))), (f"{name}_drift",))
+    model = Linearised(problem, z, Simulation(problem, z, weights), 0, np.zeros((0, len(z))), (f"{name}_drift",))
     column = model.turned(f"{name}_drift")
     assert column is not None
     h = 1e-5

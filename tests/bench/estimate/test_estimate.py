@@ -209,7 +209,7 @@ def test_records_share_the_brake_and_have_their_own_start(bench: Bench) -> None:
     assert found.labels == (*PARAMETER_NAMES, "x1_0[0]", "x1_0[1]")
     assert found.validation.fits
     assert (np.abs(found.values[4:] - [0.5, -0.3]) < 4.0 * found.deviations()[4:]).all()
-    assert [f.name for f in found.verdict().findings] == list(PARAMETER_NAMES)
+    assert [f.name for f in found.identifiability().findings] == list(PARAMETER_NAMES)
     alone = [fit(bench, plant, [r], asked) for r in records]
     shared = sum(np.linalg.inv(np.linalg.inv(e.information)[:4, :4]) for e in alone)
     assert np.linalg.inv(np.linalg.inv(found.information)[:4, :4]) == pytest.approx(shared, rel=0.05)
@@ -221,7 +221,7 @@ def test_where_each_record_started_can_be_all_that_is_asked(bench: Bench) -> Non
     found = fit(bench, plant, records, EstimationProblem(("x1_0",)))
     assert (np.abs(found.values - [0.5, -0.3]) < 4.0 * found.deviations()).all()
     assert found.theta == bench.brake
-    assert found.verdict().findings == ()
+    assert found.identifiability().findings == ()
 
 
 @pytest.mark.parametrize("method", ["oem", "pem"])
@@ -251,7 +251,7 @@ def test_what_the_data_do_not_tell_is_said_and_a_prior_settles_it(bench: Bench) 
     plant = bench.plant("exact")
     data = record(bench, plant, np.full(40, 2.0))
     blind = fit(bench, plant, [data], EstimationProblem(("k_m", "T_c")), starts=2)
-    assert [finding.identified for finding in blind.verdict().findings] == [False, False]
+    assert [finding.identified for finding in blind.identifiability().findings] == [False, False]
     assert np.isinf(blind.cramer_rao()).all()
     ranges = bench.range_set("pm50")
     found = fit(bench, plant, [data], EstimationProblem(("k_m", "T_c"), prior=ranges), starts=2)
@@ -259,7 +259,7 @@ def test_what_the_data_do_not_tell_is_said_and_a_prior_settles_it(bench: Bench) 
     scale = found.values / [bench.brake.k_m, bench.brake.T_c]
     prior = uniform_prior(ranges, ("k_m", "T_c"), bench.brake) * np.outer(scale, scale)
     assert found.prior == pytest.approx(prior, rel=1e-12)
-    assert len(found.verdict().left_to_prior) == 1
+    assert len(found.identifiability().left_to_prior) == 1
     torque = 2.0 * found.values[0] - found.values[1]
     assert torque == pytest.approx(2.0 * bench.brake.k_m - bench.brake.T_c, rel=1e-3)
 

@@ -13,9 +13,9 @@ from emb_bench.api import fisher_information
 from emb_bench.brake.parameters import COMMAND, F_V, K_1, K_M, T_C
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Plant
-from emb_bench.estimate.effects import EFFECTS, Linearised, Shown, Simulated, columns, with_systematic
+from emb_bench.estimate.effects import EFFECTS, Linearised, Prediction, Simulation, columns, with_systematic
 from emb_bench.estimate.expected import Interval, of_experiment, of_information
-from emb_bench.estimate.innovations import Filter, Followed
+from emb_bench.estimate.innovations import Filter, FilterPrediction
 from emb_bench.estimate.prediction import Problem, make_problem
 from emb_bench.estimate.records import EstimationProblem
 from emb_bench.estimate.suspects import basis_and_inverse, lacking
@@ -61,7 +61,7 @@ def test_an_effect_that_acts_as_a_current_sums_the_derivatives_to_single_current
 ) -> None:
     """An estimate has these derivatives for reports that were lost."""
     problem, z = modelled(bench, bench.plant(name), late)
-    model = Simulated(problem, z, [np.ones((len(CURRENTS), 2))])
+    model = Simulation(problem, z, [np.ones((len(CURRENTS), 2))])
     turned = Linearised(problem, z, model, 0, np.zeros((0, len(z))), tuple(EFFECTS)).shares()
     torques = {each for each, row in EFFECTS.items() if row.torque}
     assert {*turned} == torques - ({"play"} if name in ("play", "euler") else set())
@@ -89,10 +89,10 @@ def test_the_parts_of_a_parameter_in_each_period_add_to_its_derivative(
     weights = problem.weights(z)
     followed = Filter(problem, 10.0)
     gains = followed.gains(z, weights)
-    model: Shown = Simulated(problem, z, weights)
+    model: Prediction = Simulation(problem, z, weights)
     jacobian = problem.jacobian(z, weights)[1]
     if method == "pem":
-        model, jacobian = Followed(followed, z, weights, gains), followed.jacobian(z, weights, gains)[1]
+        model, jacobian = FilterPrediction(followed, z, weights, gains), followed.jacobian(z, weights, gains)[1]
     whole = -jacobian[: 2 * len(CURRENTS), :4].reshape(-1, 2, 4).transpose(0, 2, 1)
     shares = np.random.default_rng(5).uniform(-1.0, 2.0, (len(CURRENTS), 4))
     shares[10:20] = 0.0
@@ -122,10 +122,10 @@ def test_what_a_friction_leaves_beside_the_model_is_that_of_a_brake_that_has_it(
     problem = problem_of(bench, PARAMETER_NAMES, record(bench, plant, TURNING[currents](bench), seed=None))
     z = problem.nominal()
     weights = problem.weights(z)
-    model, jacobian = Simulated(problem, z, weights), problem.jacobian(z, weights)[1]
+    model, jacobian = Simulation(problem, z, weights), problem.jacobian(z, weights)[1]
     basis, inverse = basis_and_inverse(jacobian)
     changed = plant.mechanics._replace(tolerance=1e-12, break_away=1.0 + 1e-5, stribeck_velocity=FRICTION[name])
-    (more, less) = (model.shown(0, m) for m in (changed, changed._replace(break_away=1.0)))
+    (more, less) = (model.whitened_samples(0, m) for m in (changed, changed._replace(break_away=1.0)))
     change = ((more - less) / 1e-5).ravel()
     wanted = change - basis @ (basis.T @ change)
     found = lacking(columns(problem, z, model, jacobian, (name,)), basis, inverse).beside[0]
@@ -139,7 +139,7 @@ def test_estimates_of_noisy_logs_state_the_interval_that_was_expected(bench: Ben
     for seed in range(12):
         asked = with_systematic(EstimationProblem(), bench, plant)
         estimate = fit(bench, plant, [record(bench, plant, CURRENTS, seed=seed)], asked, starts=1)
-        own = estimate.wanted()
+        own = estimate.requested()
         found.append([estimate.cramer_rao()[own], estimate.between_runs()[own], estimate.deviations()[own]])
     ratios = np.median(found, axis=0) / [wanted.repeatability, wanted.between_runs, wanted.total]
     assert (np.abs(np.log(ratios)) < math.log(1.35)).all(), ratios
@@ -174,7 +174,7 @@ def test_one_effect_moves_the_parameters_by_regression(bench: Bench) -> None:
     z = problem.nominal()
     weights = problem.weights(z)
     jacobian = problem.jacobian(z, weights)[1]
-    ones = Simulated(problem, z, weights)
+    ones = Simulation(problem, z, weights)
     column = columns(problem, z, ones, jacobian, ("k_m_drift",))["k_m_drift"]
     moved, square, *_ = np.linalg.lstsq(jacobian, column, rcond=None)
     information, squares, weights_of = float(square[0]), 0.0, 0.5  # half the brakes have none

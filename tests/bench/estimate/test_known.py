@@ -51,7 +51,7 @@ def test_it_may_be_said_in_the_bench_file(bench: Bench) -> None:
     assert asked == with_systematic(asked, stated, stated.plant("exact"))
     assert asked.known["k_m"] == pytest.approx((bench.brake.k_m, 1e-3 / NORMAL_95 * bench.brake.k_m))
     assert (asked.nuisances, asked.known["J"]) == (("J",), (bench.brake.J, 0.05 * bench.brake.J))
-    assert "J" not in asked.allowed
+    assert "J" not in asked.unmodelled
     without = with_systematic(EstimationProblem(("f_v",)), stated, stated.plant("exact"))
     assert without.known == {}
 

@@ -120,7 +120,7 @@ def test_instruments_are_taken_into_account(bench: Bench) -> None:
 def test_what_the_brake_never_met_is_not_told(bench: Bench) -> None:
     data = record(bench, bench.plant("exact"), np.full(60, -1.5))
     found = estimate(bench, "exact", [data], EstimationProblem(("k_m", "k_1")))
-    assert [finding.identified for finding in found.verdict().findings] == [True, False]
+    assert [finding.identified for finding in found.identifiability().findings] == [True, False]
     assert np.isinf(found.cramer_rao()[1])
     assert found.values[1] == pytest.approx(bench.brake.k_1)
 

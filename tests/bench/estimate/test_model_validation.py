@@ -164,14 +164,14 @@ def test_an_interval_says_what_it_allows_for_most_and_holds_the_truth_where_fish
     e = fit(bench, plant, [data], with_systematic(EstimationProblem(), known, plant), method=method)
     i = e.labels.index("T_c")
     assert e.validation.fits
-    effect = e.left_open_by(i)
+    effect = e.largest_bias(i)
     assert effect is not None
     assert effect.name == "play"
-    assert e.open()[i] >= abs(effect.bias[i]) > 3.0 * e.cramer_rao()[i]
+    assert e.unmodelled_bias()[i] >= abs(effect.bias[i]) > 3.0 * e.cramer_rao()[i]
     error = abs(e.theta.T_c / bench.brake.T_c - 1.0)
     assert NORMAL_95 * e.cramer_rao()[i] < error < NORMAL_95 * e.deviations()[i]
     trusted = fit(bench, plant, [data], method=method)
-    assert trusted.left_open_by(i) is None
+    assert trusted.largest_bias(i) is None
 
 
 def scaled(bench: Bench, inertia: float, angle: float) -> Bench:
@@ -203,7 +203,7 @@ def test_what_no_record_can_know_enters_the_total_as_the_equation_of_motion_says
     known = [i for i, label in enumerate(e.labels) if label in PARAMETER_NAMES]
     both = [math.hypot(*(found[one][name] for one in OF_THE_BENCH)) for name in PARAMETER_NAMES]
     assert e.deviations()[known] == pytest.approx(np.hypot(e.between_runs()[known], both), rel=1e-6)
-    assert [finding.name for finding in e.verdict().findings] == list(PARAMETER_NAMES)
+    assert [finding.name for finding in e.identifiability().findings] == list(PARAMETER_NAMES)
     held = fit(bench, model, [data], with_systematic(EstimationProblem(("f_v",)), bench, model), method=method)
     assert held.deviations()[0] > 0.02, "held torques scale with J as well"
     trusted = fit(bench, model, [data], method=method)

@@ -110,7 +110,7 @@ def test_eliminating_the_starts_gives_the_information_of_all_unknowns_together()
     e = fitted(record(Machine(), 6.0))
     problem = make_problem(e.bench, e.plant, e.experiments, ASKED)
     cut = Cut(problem, e.z).windows
-    whole = make_problem(e.bench, e.plant, [w.experiments[0] for w in cut], cut[0].asked)
+    whole = make_problem(e.bench, e.plant, [w.experiments[0] for w in cut], cut[0].question)
     z = whole.nominal()
     z[:4] = e.z
     for i, window in enumerate(cut):  # where the estimate has its windows matters little to their derivatives

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.information.criteria import criteria, criteria_series
-from emb_bench.information.identifiability import Doubt, Spectrum, combination, judge, schur_complement
+from emb_bench.information.identifiability import Doubt, Spectrum, combination, identifiability, schur_complement
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
@@ -100,7 +100,7 @@ def test_a_singular_matrix_of_any_rank_has_the_worst_values_and_a_verdict_and_no
     correlation = Spectrum(s @ s.T).correlation()
     assert np.isfinite(correlation).all()
     assert (np.abs(correlation) <= 1.0).all()
-    verdict = judge(s @ s.T, names, np.zeros((9, 9)) if with_prior else None)
+    verdict = identifiability(s @ s.T, names, np.zeros((9, 9)) if with_prior else None)
     assert not verdict.identified
     assert [f.doubts for f in verdict.findings[:dead]] == [(Doubt.NO_INFORMATION,)] * dead
     assert all(math.isinf(f.deviation) for f in verdict.findings[:dead])
@@ -128,7 +128,7 @@ def test_parameters_on_one_flat_direction_are_correlated_by_it_and_not_with_the_
 
 def test_what_counts_as_told_depends_on_the_unit() -> None:
     # Deviations of 2: two hundred percent of k_m, two samples of delay, two rad/s at the start.
-    verdict = judge(0.25 * np.eye(3), ("k_m", "delay", "x2_0"))
+    verdict = identifiability(0.25 * np.eye(3), ("k_m", "delay", "x2_0"))
     assert [f.identified for f in verdict.findings] == [False, False, True]
     assert verdict.findings[0].doubts == (Doubt.TOO_WIDE,)
     assert verdict.findings[1].doubts == (Doubt.TOO_WIDE,)
@@ -139,7 +139,7 @@ def test_what_counts_as_told_depends_on_the_unit() -> None:
 
 def test_what_was_known_before_is_no_merit_of_the_data() -> None:
     prior = 12.0 * np.eye(2)
-    verdict = judge(prior + np.diag([100.0, 0.1]), ("k_m", "f_v"), prior)
+    verdict = identifiability(prior + np.diag([100.0, 0.1]), ("k_m", "f_v"), prior)
     assert [f.identified for f in verdict.findings] == [True, False]
     assert verdict.findings[1].doubts == (Doubt.NOTHING_NEW,)
 
@@ -154,7 +154,7 @@ def test_a_parameter_with_little_information_of_its_own_keeps_its_share_of_a_fla
     rng = np.random.default_rng(5)
     s = rng.standard_normal((40, 5)) * [1e6, 1e-1, 1e6, 1e6, 0.0]
     s[:, 4] = -s[:, :4].sum(axis=1)  # only the common scale of all five leaves no trace
-    verdict = judge(s.T @ s, FIVE)
+    verdict = identifiability(s.T @ s, FIVE)
     (direction,) = verdict.directions
     np.testing.assert_allclose(list(direction.shares.values()), np.full(5, 5**-0.5), rtol=1e-6)
     assert not any(finding.identified for finding in verdict.findings)
@@ -165,9 +165,9 @@ def test_what_only_the_prior_tells_is_said_to_come_from_it() -> None:
     s = 1e4 * rng.standard_normal((40, 5))
     s[:, 4] = -s[:, :4].sum(axis=1)
     prior = np.diag([12.0, 12.0, 12.0, 12.0, 0.0])
-    (shares,) = judge(s.T @ s + prior, FIVE, prior).left_to_prior
+    (shares,) = identifiability(s.T @ s + prior, FIVE, prior).left_to_prior
     np.testing.assert_allclose(list(shares.values()), np.full(5, 5**-0.5), rtol=1e-6)
-    assert judge(s.T @ s + prior, FIVE).left_to_prior == ()
+    assert identifiability(s.T @ s + prior, FIVE).left_to_prior == ()
 
 
 # --- Many matrices at once -----------------------------------------------------------------------------------------

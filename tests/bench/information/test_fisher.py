@@ -97,7 +97,7 @@ def test_knowing_a_range_of_fifty_percent_is_worth_twelve_and_bounds_what_a_rest
 
 def test_the_weighted_information_gives_no_bound() -> None:
     found = of(square(20, 4.0), kind="weighted", plant="euler")
-    for answer in (found.cramer_rao, found.correlation, found.verdict):
+    for answer in (found.cramer_rao, found.correlation, found.identifiability):
         with pytest.raises(UsageError):
             answer()
 
@@ -195,11 +195,11 @@ def test_with_the_inertia_free_no_sequence_tells_the_common_scale_of_all_torques
 
 def test_the_verdict_names_the_common_scale_and_the_shift_of_all_angles() -> None:
     found = of(chirp(), (*PARAMETER_NAMES, "J"), nuisances=("contact", "offset", "x1_0"))
-    scale, shift = (direction.shares for direction in found.verdict().directions)
+    scale, shift = (direction.shares for direction in found.identifiability().directions)
     assert all(scale[name] == pytest.approx(5**-0.5, rel=1e-3) for name in (*PARAMETER_NAMES, "J"))
     assert (shift["contact"], -shift["offset"], shift["x1_0"]) == pytest.approx([3**-0.5] * 3, rel=1e-3)
-    assert not found.verdict().identified
-    assert of(chirp()).verdict().identified
+    assert not found.identifiability().identified
+    assert of(chirp()).identifiability().identified
 
 
 def test_a_bound_above_the_value_itself_is_not_taken_for_an_answer() -> None:
@@ -207,7 +207,7 @@ def test_a_bound_above_the_value_itself_is_not_taken_for_an_answer() -> None:
     found = of(np.where(np.arange(500) < 100, 0.9, 0.9001))
     assert not found.criteria().singular
     assert found.criteria().log_det > 60.0
-    verdict = found.verdict(BENCH.range_set("pm50"))
+    verdict = found.identifiability(BENCH.range_set("pm50"))
     told = {finding.name: finding.identified for finding in verdict.findings}
     assert told == {"k_m": False, "k_1": True, "T_c": False, "f_v": True}
     (direction,) = verdict.directions
@@ -237,7 +237,7 @@ def test_two_estimates_that_replace_each_other_are_called_traded_off() -> None:
     correlation = found.correlation()
     np.testing.assert_allclose(correlation, correlation.T, atol=1e-12)
     assert correlation[2, 3] == pytest.approx(-0.9998, abs=1e-4)
-    (friction,) = (finding for finding in found.verdict().findings if finding.name == "T_c")
+    (friction,) = (finding for finding in found.identifiability().findings if finding.name == "T_c")
     assert list(friction.traded_with) == ["f_v"]
     assert friction.traded_with["f_v"] == pytest.approx(-0.9998, abs=1e-4)
 
@@ -249,5 +249,5 @@ def test_a_value_that_cannot_be_told_from_the_end_of_its_range_is_at_a_border() 
         (30.0, None),
         (50.0, Border.AT_UPPER),
     ):
-        verdict = of(chirp(), p=BRAKE._replace(k_1=k_1)).verdict(BENCH.range_set("viscous-stiffness"))
+        verdict = of(chirp(), p=BRAKE._replace(k_1=k_1)).identifiability(BENCH.range_set("viscous-stiffness"))
         assert {f.name: f.border for f in verdict.findings} == {"k_m": None, "k_1": expected, "T_c": None, "f_v": None}
