@@ -118,7 +118,7 @@ def report(
             study = make_study(its, logs, asked, last=before, for_report=True)
         made = Report(study, its, left_out, made_by)
         if criteria is not None and asked.acceptance is not None:
-            accepted = test.judge(criteria, Path(asked.acceptance).name, study, made.without_part)
+            accepted = test.accept(criteria, Path(asked.acceptance).name, study, made.without_part)
             made = replace(made, acceptance=accepted)
         new_numbers.write_text(json_document(document(made)) + "\n", encoding="utf-8")
         new_page.write_text(html(page_of(made)), encoding="utf-8")

@@ -34,13 +34,13 @@ class Parameter(NamedTuple):
     addition: str = ""  # What a model that grows calls it; rows of one name are added together
 
 
-_HELD = "estimate it as well: --params"
+_FREE_IT = "estimate it as well: --params"
 
 PARAMETERS: Mapping[str, Parameter] = {
-    "k_m": Parameter("N·m/A", effect="a change of k_m, which is held fixed,", remedy=_HELD),
-    "k_1": Parameter("N/rad", effect="a change of k_1, which is held fixed,", remedy=_HELD),
-    "T_c": Parameter("N·m", effect="a change of T_c, which is held fixed,", remedy=_HELD),
-    "f_v": Parameter("N·m·s/rad", effect="a change of f_v, which is held fixed,", remedy=_HELD),
+    "k_m": Parameter("N·m/A", effect="a change of k_m, which is fixed,", remedy=_FREE_IT),
+    "k_1": Parameter("N/rad", effect="a change of k_1, which is fixed,", remedy=_FREE_IT),
+    "T_c": Parameter("N·m", effect="a change of T_c, which is fixed,", remedy=_FREE_IT),
+    "f_v": Parameter("N·m·s/rad", effect="a change of f_v, which is fixed,", remedy=_FREE_IT),
     "J": Parameter(
         "kg·m²",
         about="moment of inertia [kg·m²]; scales with all torques, so that one of them has to be known",

@@ -126,9 +126,9 @@ def of_information(e: Information) -> Interval:
 
 def sampled(bench: Bench, plant: Plant, currents: Sequence[float] | Floats) -> Experiment:
     """An experiment with planned currents [A] of which each sample is received, after a rest at the origin."""
-    experiment, offset = planned(currents), plant.instruments.encoder_offset
+    experiment = planned(currents, plant.instruments.encoder_offset)
     rested = bench.noise.angle / math.sqrt(REST_SAMPLES)
-    return replace(experiment, samples=np.zeros_like(experiment.samples), angle=offset, slack=rested)
+    return replace(experiment, samples=np.zeros_like(experiment.samples), slack=rested)
 
 
 def of_experiment(

@@ -210,6 +210,7 @@ class Cause(NamedTuple):
     """Share of the misfit that it explains, to first order: 1 if it explains all of it, None if χ² is no alarm."""
     is_curve: bool  # With the other term of the clamping force's curve
     possible: bool  # Its amount is physically possible, as far as that can be judged
+    fixed: tuple[str, ...] = ()  # Parameters without an estimate, each of which may explain the misfit
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,7 @@ DISTURBED = 10.0
 filter absorbs without an alarm."""
 
 ALIKE = 0.8  # Ratio of two scores above which the suspects are about equally significant
+EXPLAINS = 3.0  # Score above which a fixed parameter may explain a misfit [standard deviations]
 DISTINGUISHED = 2.0  # Difference of two suspects' squared scores below which they are hardly distinguished
 
 DEPENDENT = 1e-6  # relative norm of a projected regressor below which it depends on the others
@@ -109,12 +110,17 @@ def score(
 def cause(m: ModelValidation, machine: Machine | None) -> Cause | None:
     """The effect that explains a misfit, or most of it; None without a significant one.
 
-    The ``machine`` is that of a bench without a brake. A score test is linear: of an effect that explains only a part
-    of the misfit the amount is unreliable, and an impossible amount does not exclude the effect.
+    The ``machine`` is that of a bench without a brake. Parameters that are not estimated come first. A score test is
+    linear: of an effect that explains only a part of the misfit the amount is unreliable, and an impossible amount does
+    not exclude the effect.
     """
-    lagging = next((s for s in m.suspects if s.observer and f"score of {s.name}" in m.alarming), None)
-    if lagging is not None:
-        return _cause(m, lagging, possible=True)
+    if m.fits:
+        return None
+    usual = PARAMETER_NAMES if machine is None else machine.unknown
+    fixed = [s for s in m.suspects if s.name in usual and abs(s.sigmas) >= EXPLAINS]
+    lagging = [s for s in m.suspects if s.observer and f"score of {s.name}" in m.alarming]
+    for s in (*lagging, *fixed):
+        return _cause(m, s, possible=True)._replace(fixed=tuple(one.name for one in fixed))
     found = [s for s in m.suspects if s.name in CURVED or (f"score of {s.name}" in m.alarming and s.name != LAGGING)]
     if not any(f"score of {s.name}" in m.alarming for s in found):
         return None

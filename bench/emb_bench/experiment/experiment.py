@@ -168,8 +168,11 @@ class Experiment:
             yield self.part(begin, begin + length)
 
 
-def planned(currents: Sequence[float] | Floats) -> Experiment:
-    """An experiment that is to be: currents [A] of its periods, from rest at the origin, no samples."""
+def planned(currents: Sequence[float] | Floats, offset: float = 0.0) -> Experiment:
+    """A planned experiment: currents [A] of its periods, from rest at the origin, without samples.
+
+    The encoder reads ``offset`` at the origin [rad].
+    """
     try:
         row = np.asarray(currents, dtype=np.float64)
     except (TypeError, ValueError) as err:
@@ -179,4 +182,4 @@ def planned(currents: Sequence[float] | Floats) -> Experiment:
     if not np.isfinite(row).all():
         k = int(np.argmin(np.isfinite(row)))
         raise UsageError(f"expected finite currents, got {row[k]} at step {k}")
-    return Experiment("planned", row, np.full((len(row), 2), np.nan), 0.0, 0.0, 0.0, True)
+    return Experiment("planned", row, np.full((len(row), 2), np.nan), offset, 0.0, 0.0, True)

@@ -317,7 +317,7 @@ def expected(
     Raises:
         UsageError: the currents are no row of finite numbers.
     """
-    experiment = planned(currents)
+    experiment = planned(currents, Theta(theta, errors=errors).offset(plant))
     if not experiment.periods:
         raise UsageError("expected at least one current")
     every, instants = replace(experiment, samples=np.zeros_like(experiment.samples)), range(experiment.periods)

@@ -1,8 +1,8 @@
 """Acceptance test of a brake: criteria from a small file, each passed, failed, or not decided by the record.
 
-A quantity with an interval passes if the whole 95 % interval lies inside the limits, fails if it lies outside, and is
-not decided if it straddles a limit: then a more informative record decides it. Nothing that rests on the model is
-decided where the model does not fit.
+A quantity passes if all of its 95 % interval lies inside the limits, and fails if all of it lies outside. If the
+interval straddles a limit, the criterion is not decided: it needs a more informative record. Criteria that depend on
+the model are not decided if the model does not fit.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Criteria(msgspec.Struct, frozen=True):
     budgets: Budgets = Budgets()
 
     def __post_init__(self) -> None:
-        """Refuse unknowns that are no brake's, and a share of what has no size."""
+        """Refuse unknowns that a brake does not have, and a relative tolerance of one with a unit."""
         for place, names in (("parameters", self.parameters), ("drift", self.drift)):
             for name in names:
                 if name not in SHARED:
@@ -101,7 +101,7 @@ class Acceptance:
 
     @property
     def result(self) -> Result:
-        """The whole: failed if one criterion is, else not decided if one is not."""
+        """Overall result: the worst one, failed before not decided before passed."""
         found = {one.result for one in self.results}
         return next((r for r in (Result.FAIL, Result.CANNOT_TELL) if r in found), Result.PASS)
 
@@ -111,7 +111,7 @@ class Acceptance:
 
     @property
     def verdict(self) -> str:
-        """The whole in one line, with the criteria that decided it."""
+        """Overall result in one line, with the criteria that decided it."""
         count, of_result = len(self.results), self.of(self.result)
         names = ", ".join(one.name for one in of_result)
         if self.result == Result.FAIL:
@@ -145,10 +145,10 @@ def read_criteria(path: Path) -> Criteria:
     return read(_File, content, source, UsageError).acceptance
 
 
-def judge(criteria: Criteria, source: str, study: Study, without_part: Sequence[str]) -> Acceptance:
-    """Results of all criteria. That each run came to its end and its log is whole is always one of them.
+def accept(criteria: Criteria, source: str, study: Study, without_part: Sequence[str]) -> Acceptance:
+    """Results of all criteria; the first ones are always that each run came to its end with a complete log.
 
-    ``source`` is the name of their file, ``without_part`` says of each log that is not used why.
+    ``source`` is the name of their file; ``without_part`` has the reason for each log that is not used.
     """
     runs, several = study.runs, len(study.runs) > 1
     results = [_completed(run, several) for run in runs]
@@ -173,7 +173,7 @@ def judge(criteria: Criteria, source: str, study: Study, without_part: Sequence[
 
 
 def _doubt(study: Study) -> str:
-    """Reason that no number of the estimate decides anything; empty if they may."""
+    """Reason that the numbers of the estimate decide nothing; empty if they do."""
     return {
         Code.NO_ESTIMATE: f"no estimate: {study.why_not}",
         Code.BIASED_METHOD: "recursive least squares is biased: use --method oem",
@@ -239,14 +239,14 @@ def _inside(interval: tuple[float, float], limits: tuple[float, float], doubt: s
     if limits[0] <= interval[0] and interval[1] <= limits[1]:
         return Result.PASS, ""
     if interval[1] < limits[0] or interval[0] > limits[1]:
-        return Result.FAIL, "the whole 95 % interval is outside the limits"
+        return Result.FAIL, "all of the 95 % interval is outside the limits"
     return Result.CANNOT_TELL, "the 95 % interval straddles a limit"
 
 
 def _counted(name: str, most: float, found: float | None) -> Criterion:
     required = f"at most {share(most, 3)}"
     if found is None:
-        return Criterion(name, required, "not measured", Result.CANNOT_TELL, "the log does not say")
+        return Criterion(name, required, "not measured", Result.CANNOT_TELL, "not in the log")
     result = Result.PASS if found <= most else Result.FAIL
     return Criterion(name, required, share(found, 3), result, "" if found <= most else "over the budget")
 
@@ -259,10 +259,10 @@ def junit(found: Acceptance) -> str:
     suite = ElementTree.Element("testsuite", {"name": found.source, **counts})
     for one, result in results:
         case = ElementTree.SubElement(suite, "testcase", {"classname": found.source, "name": one.name})
-        said = f"required {one.required}; found {one.found}"
+        message = f"required {one.required}; found {one.found}"
         if result is not Result.PASS:
             kind = "failure" if result is Result.FAIL else "skipped"
-            ElementTree.SubElement(case, kind, {"message": one.why}).text = said
+            ElementTree.SubElement(case, kind, {"message": one.why}).text = message
         else:
-            ElementTree.SubElement(case, "system-out").text = said
+            ElementTree.SubElement(case, "system-out").text = message
     return NOT_XML.sub("\ufffd", ElementTree.tostring(suite, encoding="unicode", xml_declaration=True)) + "\n"

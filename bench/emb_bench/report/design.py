@@ -15,14 +15,14 @@ if TYPE_CHECKING:  # a search for designs takes a second to import
 
 
 def text(report: Report, written: str = "", *, verbose: bool = False) -> str:
-    """Value of the criterion, the limits on the design's own brake, and what the design would tell."""
-    d, own = report.metadata(), report.checks[0]
+    """Value of the criterion, and limits and smallest repeatabilities on the brake of the design."""
+    d, nominal = report.metadata(), report.checks[0]
     alone = "" if report.problem.weights.velocity else " of the angle alone"
     brake = f"{d['model']}, {d['kind']} information{alone}, {'returns home' if d['returns'] else 'ends anywhere'}"
     optima = ", ".join(f"{value:.6g}" for value in d["local_optima"][: None if verbose else 4])
     bounds = ", ".join(f"{name} {_half(bound, name)}" for name, bound in (d["cramer_rao"] or {}).items())
     lines = facts(
-        (d["value_is"], f"{d['value']:.7g}; {_verdict(own)}"),
+        (d["value_is"], f"{d['value']:.7g}; {_verdict(nominal)}"),
         ("criterion", f"{d['criterion']} of {', '.join(d['params'])}"),
         ("brake", brake),
         ("repeatability", bounds and f"smallest possible, ± 95 % (k=2): {bounds}"),
@@ -43,7 +43,7 @@ def _verdict(check: Check) -> str:
 
 
 def _checks(report: Report) -> Table:
-    """The design simulated again, on its own brake first."""
+    """Simulations of the design, on the brake that it was made for first."""
     rows = [
         [
             *(c.plant, f"{c.log_det:.4f}", f"{c.lowest_angle:.3f} to {c.highest_angle:.3f}", f"{c.largest_speed:.2f}"),

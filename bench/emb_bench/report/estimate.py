@@ -22,12 +22,12 @@ from emb_bench.report.information import directions, doubts, trade_offs
 from emb_bench.report.text import Table, facts, listed, wrapped
 from emb_runtime.numbers import plain
 
-SCALE = "below that: docs/howto/below-two-percent.md"  # What to do where J limits
-NOTICED = 2.0  # Standard deviations from which on an effect that is no alarm is named
+SCALE = "below that: docs/howto/below-two-percent.md"  # If J limits an interval
+NOTICED = 2.0  # Score above which an effect without an alarm is named [standard deviations]
 
 
 def text(study: Study, *, verbose: bool = False) -> str:
-    """Verdict, parameters, what limits them, next step; with ``verbose`` the evidence, too."""
+    """Verdict, parameters, what limits them, next step; with ``verbose`` also the evidence."""
     e, found = study.estimate, verdict(study)
     lines = [
         *stops(study),
@@ -73,18 +73,18 @@ def _notes(study: Study) -> list[str]:
 
 
 def _remarks(study: Study, *, trades: bool) -> Iterator[str]:
-    """Doubts and changes of parameters, and their ``trades``-off, each with all parameters that it holds for."""
-    said: dict[str, list[str]] = {}
+    """Doubts and changes of parameters, with ``trades`` also trade-offs; equal remarks once, with all parameters."""
+    labels_of: dict[str, list[str]] = {}
     for c in study.conclusions:
         remarks = [doubts(c.finding), trade_offs(c.finding) if trades else ""]
         remarks += [say.drift(c.drift)] if c.drift is not None else []
         if text := "; ".join(filter(None, remarks)):
-            said.setdefault(text, []).append(c.label)
-    yield from (f"{', '.join(labels)}: {text}" for text, labels in said.items())
+            labels_of.setdefault(text, []).append(c.label)
+    yield from (f"{', '.join(labels)}: {text}" for text, labels in labels_of.items())
 
 
 def _limits(study: Study) -> Iterator[str]:
-    """Effects that limit the intervals, and effects that the residuals hint at."""
+    """Effects that limit the intervals, and effects with a high score but no alarm."""
     e = study.estimate
     by: dict[str, list[str]] = {}
     for i in e.requested():
@@ -123,7 +123,7 @@ def _evidence(study: Study) -> Iterator[str]:
     expected = f"{plain(m.ratio, 4)} of {m.freedom}, {m.expected[0]:.3f} to {m.expected[1]:.3f} expected"
     yield ""
     yield from facts(
-        *(("record", said) for said in measured),
+        *(("record", line) for line in measured),
         ("method", f"{METHODS[e.method]}, model {e.plant.name} ({say.model_reason(study)})"),
         ("prior", say.prior(e)),
         ("chi2/n", f"{expected} ({p_value(m.chi2_p)})"),
@@ -147,7 +147,7 @@ def document(study: Study) -> dict[str, Any]:
     """Everything about a study; numbers may be infinite."""
     e, checks = study.estimate, study.checks
     choice = checks.choice
-    wanted, validation = e.requested(), e.validation
+    index, validation = e.requested(), e.validation
     found = {
         "simulated": any(log.simulated for log in study.logs),
         "method": METHODS[e.method],
@@ -180,10 +180,10 @@ def document(study: Study) -> dict[str, Any]:
         "models_left_out": choice.same if choice is not None else (),
         "not_told_apart": [c.name for c in choice.plausible] if choice and len(choice.plausible) > 1 else None,
         "correlation": {
-            "names": [e.labels[i] for i in wanted],
-            "matrix": e.correlation()[np.ix_(wanted, wanted)],
+            "names": [e.labels[i] for i in index],
+            "matrix": e.correlation()[np.ix_(index, index)],
         },
-        "information": schur_complement(e.information, wanted),
+        "information": schur_complement(e.information, index),
         "directions": e.identifiability().directions,
         "left_to_prior": e.identifiability().left_to_prior,
         "profiles": [
@@ -191,7 +191,7 @@ def document(study: Study) -> dict[str, Any]:
         ],
         "starts": [
             _fields(end, "cost", "converged", "evaluations")
-            | {"values": _shown(e, end.z), "from": _shown(e, end.start)}
+            | {"values": _by_label(e, end.z), "from": _by_label(e, end.start)}
             for end in e.ends
         ],
     }
@@ -219,7 +219,7 @@ def _fields(record: object, *names: str) -> dict[str, Any]:
     return {name: getattr(record, name) for name in names}
 
 
-def _shown(e: Estimate, z: Floats) -> dict[str, float]:
+def _by_label(e: Estimate, z: Floats) -> dict[str, float]:
     """Values of the unknowns by label."""
     return dict(zip(e.labels, e.problem.values(z).tolist(), strict=True))
 

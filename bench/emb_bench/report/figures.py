@@ -35,7 +35,7 @@ _SAME = 1e-3  # of the bench's current; the CAN signal has steps
 def excitation(motion: Motion, cycles: ActiveCycles) -> Panel:
     """Current as requested by the policy, sent and applied; below, the reasons for their difference over time."""
     limit, period, after = motion.bench.limits.current, motion.bench.timing.sample_time, motion.after
-    held = [reason for reason, where in cycles.reasons.items() if where.any()]
+    present = [reason for reason, where in cycles.reasons.items() if where.any()]
 
     def draw(axes: Any) -> None:
         above = axes[0, 0]
@@ -43,7 +43,9 @@ def excitation(motion: Motion, cycles: ActiveCycles) -> Panel:
             above.axhline(value, **DASHED)
         above.axhline(0.0, **FAINT)
         time = 1e3 * cycles.time
-        above.step(time, cycles.wanted, where="post", color=COLOURS[5], label="requested by the policy", linewidth=2.6)
+        above.step(
+            time, cycles.requested, where="post", color=COLOURS[5], label="requested by the policy", linewidth=2.6
+        )
         if cycles.reasons[Reason.CLIPPED].any():
             above.step(time, cycles.clipped, where="post", color=COLOURS[4], label="clipped", linewidth=1.6)
         above.step(time, cycles.sent, where="post", color=COLOURS[0], label="sent after the shield", linewidth=1.3)
@@ -57,28 +59,28 @@ def excitation(motion: Motion, cycles: ActiveCycles) -> Panel:
         above.set_ylim(-1.2 * limit, 1.2 * limit)
         above.set_ylabel("current [A]")
         above.legend(ncols=2, **_LEGEND)
-        if held:
+        if present:
             below = axes[1, 0]
-            for row, reason in enumerate(held):
+            for row, reason in enumerate(present):
                 spans = [
                     (1e3 * begin, 1e3 * length) for begin, length in _spans(cycles.time, cycles.reasons[reason], period)
                 ]
                 below.broken_barh(spans, (row - 0.35, 0.7), color=COLOURS[1 + row])
-            below.set_yticks(range(len(held)), [str(reason.name).lower() for reason in held])
-            below.set_ylim(len(held) - 0.5, -0.5)
+            below.set_yticks(range(len(present)), [str(reason.name).lower() for reason in present])
+            below.set_ylim(len(present) - 0.5, -0.5)
             below.grid(visible=False)
         axes[-1, 0].set_xlabel("time [ms]")
         axes[-1, 0].set_xlim(0.0, 1e3 * max(_end(cycles) + period, 0.0 if after is None else after.end))
 
-    ratios = (6, len(held)) if held else (1,)
-    drawn = svg(draw, len(ratios), 1, (PANEL, 2.5 + 0.22 * len(held)), sharex=True, height_ratios=ratios)
+    ratios = (6, len(present)) if present else (1,)
+    drawn = svg(draw, len(ratios), 1, (PANEL, 2.5 + 0.22 * len(present)), sharex=True, height_ratios=ratios)
     return Panel(
         drawn, "Current over time: requested by the policy, clipped, sent and applied, with marks where they differ"
     )
 
 
 def applied(motion: Motion, experiment: Experiment) -> Panel:
-    """Command or current that drove the machine of a recording of others, in its own unit."""
+    """Command or current of the machine of a recording, in the unit of its map."""
     shown = quantity(motion.bench.machine, "current")
 
     def draw(axes: Any) -> None:
@@ -95,7 +97,7 @@ def applied(motion: Motion, experiment: Experiment) -> Panel:
 
 
 def of_run(motion: Motion) -> list[Panel]:
-    """Figures of what the brake did."""
+    """Figures of a run."""
     drawn = angle_and_velocity(motion)
     if motion.cycles is not None:
         drawn.append(excitation(motion, motion.cycles))
@@ -118,7 +120,7 @@ def _mark_stop(axis: Any, cycles: ActiveCycles, after: StopSamples) -> None:
 
 
 def applied_as_sent(motion: Motion) -> bool:
-    """Returns True if the node applied in every period the current sent for it; False if either is unknown in one."""
+    """Returns True if the node applied the sent current in every period; False if either is missing in one."""
     cycles = motion.cycles
     if motion.experiment is None or cycles is None:
         return False
@@ -174,7 +176,7 @@ def angle_and_velocity(motion: Motion) -> list[Panel]:
                 axis.plot(1e3 * when, values, ".", color=GREY, markersize=3.0, label="while stopping")
                 seen = np.concatenate([seen, values[np.isfinite(values)]])
                 _mark_stop(axis, cycles, after)
-            # The limits are shown where the brake comes near them, and never at the cost of what it did.
+            # The axis contains all samples, and the limits.
             low, high = borders[i]
             bottom, top = min(low, seen.min(initial=0.0)), max(high, seen.max(initial=0.0))
             axis.set_ylim(bottom - 0.05 * (top - bottom), top + 0.05 * (top - bottom))
@@ -217,9 +219,9 @@ ACROSS = 4  # Most panels side by side
 
 
 def axis_unit(e: Estimate, i: int, farthest: float) -> tuple[float, str]:
-    """Factor and unit for distances of an unknown from its estimate, SI units: of its value, or in its unit.
+    """Factor and unit of the axis for distances of an unknown from its estimate, the ``farthest`` given in SI units.
 
-    With them the ``farthest`` has no power of ten.
+    Relative to the value, or in its unit.
     """
     if not e.unknowns[i].relative:
         unit, power = e.quantities[i].unit, math.floor(math.log10(farthest)) if farthest > 0.0 else 0

@@ -99,7 +99,7 @@ def expected_interval(e: Evaluation) -> Interval | str:
 
 
 def text(e: Evaluation, *, verbose: bool = False) -> str:
-    """The smallest possible repeatabilities; what is missing comes first. With ``verbose`` the criteria over time."""
+    """Defects of the log, then the smallest possible repeatabilities; with ``verbose`` the criteria over time."""
     doubts, lines = [*listed("WARNING: ", say.warnings(e)), *listed("NOTE: ", say.notes(e))], _heading(e)
     velocity = "" if e.fit.velocity is None else f", velocity {plain(e.fit.velocity)}"
     fit = f"rms: angle {plain(e.fit.angle)}{velocity} sigma (at most {e.fit.expected:.2f} if it fits)"
@@ -123,7 +123,7 @@ def text(e: Evaluation, *, verbose: bool = False) -> str:
 
 
 def _expected(e: Evaluation, prior: str) -> list[str]:
-    """Interval that an estimate of the record will have, with the effect that leaves most of each interval."""
+    """Intervals that an estimate of the record will have, with the largest effect of each."""
     interval = expected_interval(e)
     if isinstance(interval, str):
         return listed("no interval of an estimate: ", [interval])
@@ -143,7 +143,7 @@ def _expected(e: Evaluation, prior: str) -> list[str]:
 def _why(e: Evaluation) -> str:
     """Reason for the model."""
     name, why = default_model(e.log)
-    return why if name == e.plant.name else "asked for"
+    return why if name == e.plant.name else "as requested"
 
 
 def _half(deviation: float, unit: str) -> str:
@@ -153,7 +153,7 @@ def _half(deviation: float, unit: str) -> str:
 
 
 def _details(e: Evaluation) -> list[str]:
-    """Criteria of both informations, and how they grew."""
+    """Criteria of both informations, at the end and over time."""
     final = {kind: e.fisher(kind).criteria().renamed(e.bench.machine) for kind in KINDS}
     rows = [[label, *(plain(getattr(final[kind], name), 6) for kind in KINDS)] for label, name in CRITERIA.items()]
     table = Table("", ("Fisher information", *KINDS), rows).lines()
@@ -189,8 +189,8 @@ def _heading(e: Evaluation) -> list[str]:
     else:
         values = e.theta._asdict()
         names = [n for n in (*PARAMETER_NAMES, "J") if values[n] and (n != "k_m" or machine.command not in LOADS)]
-        known = ((quantity(machine, name), values[name]) for name in names)
-        theta = ", ".join(f"{shown.name} = {plain(value, 4)} {shown.unit}" for shown, value in known)
+        given = ((quantity(machine, name), values[name]) for name in names)
+        theta = ", ".join(f"{shown.name} = {plain(value, 4)} {shown.unit}" for shown, value in given)
     return facts(
         ("log", f"{e.log.path}: {run}"),
         ("theta", f"{e.theta_name}: {theta}"),

@@ -15,7 +15,7 @@ from emb_runtime.numbers import plain
 DOUBTS = {
     Doubt.NO_INFORMATION: "no effect on the record",
     Doubt.ONLY_COMBINED: "only in combination with others",
-    Doubt.NOTHING_NEW: "the record adds nothing to what was known before",
+    Doubt.NOTHING_NEW: "the record adds nothing to the prior",
     Doubt.TOO_WIDE: "the best possible interval is as large as the value or a gross error",
     Doubt.FLAT: "no value within the search is excluded",
     Doubt.OPEN_BELOW: "only values above the interval are excluded",
@@ -36,20 +36,19 @@ BORDERS = {
 
 LACKS = {
     Lack.ENDS_EARLY: "the experiment ends after {} of {} samples",
-    Lack.LOST: "{} samples were lost: they count for no information, and what acted in the periods before them was not "
+    Lack.LOST: "{} samples were lost: they have no information, and the currents of the periods before them were not "
     "reported",
-    Lack.LOST_WITH_CHARGE: "{} samples were lost: they count for no information, and what acted in the periods before "
-    "them was not reported; the charge gives it for {} periods",
-    Lack.CONTRADICTED: "in {} periods the node reports another current than the command says",
-    Lack.NO_COUNTERS: "the recording has no counters, answers or states: a repeated, late or lost command cannot be "
-    "told",
+    Lack.LOST_WITH_CHARGE: "{} samples were lost: they have no information, and the currents of the periods before "
+    "them were not reported; the charge gives them for {} periods",
+    Lack.CONTRADICTED: "in {} periods the node reports another current than that of the command",
+    Lack.NO_COUNTERS: "the recording has no counters, answers or states: repeated, late or lost commands do not show",
     Lack.NO_VELOCITY: "the recording has no velocity: an observer ({:g} rad/s) derives one from the angles, which has "
     "no weight in an estimate",
-    Lack.NO_CURRENT: "the recording has no measured current: what acted is taken to be what was commanded",
-    Lack.NO_COMMANDS: "the recording has no commands: what acted is the mean of the measured current over each period",
-    Lack.NO_TIMES: "the recording has no times: its rows are taken to be one sample time apart",
-    Lack.LOST_OF_RECORDING: "{} samples are lost: what acted in the periods before them is not known to have acted",
-    Lack.HEAD: "line {} of the file is taken for its head, and the lines before it are left out",
+    Lack.NO_CURRENT: "the recording has no measured current: the applied current is assumed to be the commanded one",
+    Lack.NO_COMMANDS: "no commands in the recording: the applied current is the mean measured one of each period",
+    Lack.NO_TIMES: "the recording has no times: its rows are assumed to be one sample time apart",
+    Lack.LOST_OF_RECORDING: "{} samples are lost: the currents of the periods before them are uncertain",
+    Lack.HEAD: "line {} of the file is its head; the lines before it are skipped",
     Lack.OTHER_FRAMES: "{} frames were skipped, of {} identifiers that the map does not name",
     Lack.BAD_FRAMES: "{} frames do not fit the DBC and were skipped",
 }
@@ -57,20 +56,20 @@ LACKS = {
 
 
 def lacks(x: Experiment, but: Collection[Lack] = ()) -> list[str]:
-    """Parts of an experiment that are missing, or not to be trusted."""
+    """Missing or uncertain parts of an experiment."""
     return [LACKS[lack].format(*numbers) for lack, numbers in x.quality.lacks.items() if lack not in but]
 
 
-def taken_for_acted(x: Experiment) -> list[str]:
-    """The currents that were taken for those that acted, where these are not the reported ones."""
+def assumed_currents(x: Experiment) -> list[str]:
+    """Assumptions about the applied currents that are not the reported ones."""
     q = x.quality
     if q.within is None:
         return []
     if math.isnan(q.within):
-        return ["the drive's mapping is not readable: what acted is taken to be what the drive reported"]
+        return ["the drive's mapping is not readable: the applied currents are assumed to be the reported ones"]
     return [
-        f"what acted is taken to be the command as its bus carried it, {in_samples(q.command_delay)} late, where what "
-        f"the drive reported lies within {q.within:.3g} A of it, and elsewhere what the drive reported"
+        f"the applied current is assumed to be the command on the bus, {in_samples(q.command_delay)} late, if "
+        f"the drive reports one within {q.within:.3g} A of it, else the reported one"
     ]
 
 
@@ -80,7 +79,7 @@ def doubts(f: Finding) -> str:
 
 
 def trade_offs(f: Finding) -> str:
-    """Parameters whose errors compensate one of this parameter, with the correlations; empty without any."""
+    """Parameters with which it trades off, with the correlations; empty without any."""
     others = ", ".join(f"{name} (correlation {plain(correlation, 4)})" for name, correlation in f.traded_with.items())
     return f"trades off with {others}" if others else ""
 
@@ -116,7 +115,7 @@ def warnings(e: Evaluation) -> list[str]:
         )
     if e.absent:
         found.append(
-            f"{', '.join(e.absent)} is zero in the model '{e.plant.name}': the data say nothing about it; use a model "
+            f"{', '.join(e.absent)} is zero in the model '{e.plant.name}', which has no sensitivity to it; use a model "
             "that has it"
         )
     if e.fit.fits:
@@ -125,10 +124,10 @@ def warnings(e: Evaluation) -> list[str]:
         why = (
             "theta is a guess of the map: pass --theta with an estimate"
             if e.theta_name == "nominal"
-            else "the model does not include what disturbed the machine"
+            else "the model lacks a disturbance of the machine"
         )
     elif e.log.missing or e.experiment.quality.lacks:
-        why = "what is missing hides whether theta is right"
+        why = "with missing data theta cannot be tested"
     else:
         why = "pass --theta or --model"
     worst = max(e.fit.compared)
@@ -140,10 +139,10 @@ def warnings(e: Evaluation) -> list[str]:
 
 def notes(e: Evaluation) -> list[str]:
     """Assumptions about the currents that acted, and effects of the model's instruments."""
-    instruments, found = e.plant.instruments, taken_for_acted(e.experiment)
-    if known := {name: value for name, value in e.errors._asdict().items() if value}:
-        values = ", ".join(f"{n} = {plain(v)} {UNITS[n]}".removesuffix(" 1") for n, v in known.items())
-        found.append(f"systematic errors of this record, from {e.theta_name}, are taken as known: {values}")
+    instruments, found = e.plant.instruments, assumed_currents(e.experiment)
+    if given := {name: value for name, value in e.errors._asdict().items() if value}:
+        values = ", ".join(f"{n} = {plain(v)} {UNITS[n]}".removesuffix(" 1") for n, v in given.items())
+        found.append(f"systematic errors of this record are fixed at those of {e.theta_name}: {values}")
     if instruments.observer_bandwidth > 0.0:
         found.append("the velocity is an observer's and adds no physical information")
     if instruments.clock_jitter > 0.0:

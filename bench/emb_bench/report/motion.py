@@ -1,4 +1,4 @@
-"""Motion and currents of a run as its log has them, beside what the estimate predicts."""
+"""Motion and currents of a run by its log, with the prediction of the estimate."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Motion:
 
     @classmethod
     def of(cls, run: StudiedRun, bench: Bench, study: Study | None = None) -> Self:
-        """The motion of a run; with a study, the prediction of its estimate, too."""
+        """The motion of a run; with a study also the prediction of its estimate."""
         try:
             cycles: ActiveCycles | None = ActiveCycles(run.log, bench)
         except LogError:
@@ -58,8 +58,8 @@ class Motion:
         after = None if run.stop is None else _after(run.log, bench)
         if study is None or run.why_not:
             return cls(run, bench, cycles, after)
-        e, number = study.estimate, [own.log for own in study.used].index(run.log)
-        # With a start for each window there is no prediction of the whole run.
+        e, number = study.estimate, study.logs.index(run.log)
+        # With a start for each window there is no prediction of the run as one.
         predicted = None if e.method == "windows" else e.problem.motion(e.z, number).samples
         return cls(run, bench, cycles, after, e.residuals[number], predicted)
 
@@ -73,7 +73,7 @@ class ActiveCycles:
         active = timing.in_control(cycles)
         self.time: Floats = cycles["step"][active] * bench.timing.sample_time
         """Time since the run began [s]."""
-        self.wanted, self.clipped, self.sent = (
+        self.requested, self.clipped, self.sent = (
             cycles[f"{name}_current"][active] for name in ("policy", "clipped", "sent")
         )
         """Currents [A], NaN where there was none."""
@@ -81,7 +81,7 @@ class ActiveCycles:
         """Angle [rad] and velocity [rad/s] in the samples that the loop received."""
         reasons = cycles["reasons"][active]
         self.reasons = {reason: (reasons & reason) != 0 for reason in REASONS}
-        """Mask of the cycles in which each reason held."""
+        """Mask of the cycles with each reason."""
         self.largest = cycle_summary(log).largest
         """Extremes of angle, speed and current, as the command ``info`` gives them."""
 

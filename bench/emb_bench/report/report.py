@@ -25,7 +25,7 @@ from emb_bench.report import sentences as say
 from emb_bench.report.acceptance import Acceptance
 from emb_bench.report.caveats import caveats
 from emb_bench.report.estimate import document as estimate_document
-from emb_bench.report.information import lacks, taken_for_acted
+from emb_bench.report.information import assumed_currents, lacks
 from emb_bench.report.motion import REASONS, Motion
 from emb_bench.report.page import (
     LONGEST,
@@ -52,18 +52,18 @@ UNITS_OF_METADATA = {
     **{name: row.unit for name, row in PARAMETERS.items() if row.unit != "1"},
 }  # fmt: skip
 """Units of numbers in a log's metadata, by the ends of their names."""
-EVENTS = 200  # Most safety events that are shown; report.json has them all
-SHORT_HASH = 16  # Digits of a hash that are shown where there is no room for all
+EVENTS = 200  # Most safety events on the page; report.json has all
+SHORT_HASH = 16  # Digits of an abbreviated hash
 BLANK = ("Tested by, date", ""), ("Signature", "")  # Lines to be written on
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Report:
-    """A study with what a page about it needs besides."""
+    """A study with all further content of its page."""
 
     study: Study
     bench: Bench
-    left_out: Sequence[tuple[Path, str]]  # Files that could not be used at all, and why
+    left_out: Sequence[tuple[Path, str]]  # Unusable files with the reasons
     made_by: str  # Name and version of the tool that made the report
     acceptance: Acceptance | None = None  # Results of the acceptance criteria; None if none were given
 
@@ -73,12 +73,12 @@ class Report:
 
     @property
     def simulated(self) -> str:
-        """That the values are not those of a real machine; empty if no log says so."""
+        """Sentence on simulated runs; empty without any."""
         return say.simulated(self.study)
 
     @property
     def sentence(self) -> str:
-        """The verdict in one line, behind the sentence that the machine was none."""
+        """The verdict in one line, after the sentence on simulated runs."""
         return " ".join(filter(None, (self.simulated, self._sentence)))
 
     @property
@@ -100,7 +100,7 @@ class Report:
 
     @property
     def without_part(self) -> list[str]:
-        """Reason for each log that was given and not used, beginning with its name."""
+        """Reason for each unused log, after its name."""
         runs = [f"{run.name}: not used in the estimate: {run.why_not}" for run in self.study.runs if run.why_not]
         return [*(f"{path.name}: left out: {why}" for path, why in self.left_out), *runs]
 
@@ -117,7 +117,7 @@ class Report:
 def page_of(report: Report) -> Page:
     """The page about a report."""
     study, found, compared = report.study, report.verdict, report.study.side_by_side
-    # Of an experiment that was cut short no value is used, nor a prediction with it.
+    # An experiment that was cut short gives neither values nor a prediction.
     shown = study.joint is not None and found.code is not Code.ABORTED
     runs = study.runs
     one = runs[0] if len(runs) == 1 else None
@@ -157,7 +157,7 @@ def page_of(report: Report) -> Page:
             Section("words", "What the words mean", _words(study if shown else None), 3, folded=True),
         ],
         footer=f"Made by {report.made_by} from {', '.join(names)}. The JSON file beside this page has the same "
-        "numbers. Copy this page only as a whole.",
+        "numbers. Copy this page only in full.",
     )
 
 
@@ -172,7 +172,7 @@ def _banners(report: Report, found: Verdict, *, shown: bool) -> Iterator[Text]:
         if not run.log.complete:
             yield Text(f"{run.name}: the log is NOT complete: {run.log.missing}", "banner care")
     yield from (Text(say.stopped(stop), "banner bad") for stop in study.stops[0 if study.side_by_side else 1 :])
-    # Without an estimate the first sentence names the runs already, but not the files that were left out.
+    # Without an estimate the first sentence names the unused runs, but not the unusable files.
     lines = report.without_part if study.joint is not None else report.without_part[: len(report.left_out)]
     yield from (Text(line, "banner care") for line in lines)
 
@@ -182,9 +182,12 @@ def _summary(report: Report, found: Verdict, *, shown: bool) -> Iterator[Block |
     study, rows = report.study, list[tuple[str, Words | Sequence[Block]]]()
     one = study.runs[0] if len(study.runs) == 1 else None
     if study.side_by_side:
-        for own in study.side_by_side:
-            name = own.names[0]
-            rows += [(f"Model, {name}", list(_model(own, verdict(own)))), (f"Run, {name}", _end(own.runs[0]))]
+        for one_run in study.side_by_side:
+            name = one_run.names[0]
+            rows += [
+                (f"Model, {name}", list(_model(one_run, verdict(one_run)))),
+                (f"Run, {name}", _end(one_run.runs[0])),
+            ]
     else:
         rows.append(("Model", list(_model(study, found)) if shown else _not_judged(study)))
     if one is not None:
@@ -200,9 +203,9 @@ def _summary(report: Report, found: Verdict, *, shown: bool) -> Iterator[Block |
     yield Text(f"sigma: {say.TERMS['sigma']}. chi2/n: {say.TERMS['chi2/n']}.", "note print")
     mark = "{}: {}" if study.side_by_side else "{1}"
     if defects := [
-        mark.format(own.names[0], line)
-        for own in study.side_by_side or [study]
-        for line in (*say.missing(own), *caveats(own.estimate))
+        mark.format(one_run.names[0], line)
+        for one_run in study.side_by_side or [study]
+        for line in (*say.missing(one_run), *caveats(one_run.estimate))
     ]:
         yield Heading("Before using a number", 3)
         yield Items(defects, "warnings")
@@ -232,27 +235,27 @@ def _model(study: Study, found: Verdict) -> Iterator[Block]:
 
 
 def _end(run: StudiedRun) -> Words:
-    """End of a run, its samples, and whether its log is whole."""
+    """End of a run, its samples, and whether its log is complete."""
     log, x = run.log, run.experiment
     detail, samples = log.end.get("detail"), 0 if x is None else int(x.measured.sum())
     periods = "" if x is None else f"{x.periods} of {x.quality.planned} periods, "
-    said = f"{periods}{samples} sample{'s' * (samples != 1)}; " if periods else ""
-    whole = Cell("the log is complete", "good") if log.complete else Cell("the log is NOT complete", "bad")
+    counts = f"{periods}{samples} sample{'s' * (samples != 1)}; " if periods else ""
+    completeness = Cell("the log is complete", "good") if log.complete else Cell("the log is NOT complete", "bad")
     end = Cell(log.exit_reason, "good" if log.exit_reason == DONE else "bad")
-    return [end, f" ({detail})" if detail else "", f"; {said}", whole]
+    return [end, f" ({detail})" if detail else "", f"; {counts}", completeness]
 
 
 def _runs(runs: Sequence[StudiedRun], found: Sequence[trend.Trend]) -> list[Block | None]:
-    """Each run by itself, and whether they agree."""
+    """Each run alone, and the test whether they agree."""
     agreed: list[Words] = []
     for one in found:
         if (test := one.agreement) is not None:
             chance = p_value(test.p_value)
-            says = f": the runs agree ({chance})." if test.constant else (
+            sentence = f": the runs agree ({chance})." if test.constant else (
                 f": the runs do NOT agree: they scatter {plain(test.scatter)} times as much as their intervals allow "
                 f"({chance})."
             )  # fmt: skip
-            agreed.append([Cell(one.label, "good" if test.constant else "bad"), says])
+            agreed.append([Cell(one.label, "good" if test.constant else "bad"), sentence])
     panels = trend.panels(found)
     caption = (
         "Each run is evaluated alone, in the order of the logs. Shown is the distance from the median of the runs in "
@@ -263,13 +266,13 @@ def _runs(runs: Sequence[StudiedRun], found: Sequence[trend.Trend]) -> list[Bloc
 
 def _compared(study: Study, drawn: Sequence[Sequence[Panel]]) -> list[Block | None]:
     """Two runs in a column each: verdict, parameters, motion."""
-    left, right = study.names
+    first, second = study.names
     pairs = [panel for pair in zip(*drawn, strict=False) for panel in pair]
-    caption = f"Left (on a narrow page first) {left}, right {right}; each with the prediction of its own estimate."
-    wrong = [own for own in study.side_by_side if not verdict(own).holds]
+    caption = f"Left (on a narrow page first) {first}, right {second}; each with the prediction of its estimate."
+    wrong = [one.names[0] for one in study.side_by_side if not verdict(one).holds]
     return [
         tables.compared(study.side_by_side),
-        *(Text(f"{own.names[0]}: the intervals do not include the error of a wrong model.", "bad") for own in wrong),
+        *(Text(f"{name}: the intervals do not include the error of a wrong model.", "bad") for name in wrong),
         _care(say.changed_model(study.side_by_side[1])),
         Figures(pairs, caption),
     ]
@@ -280,7 +283,7 @@ def _parameters(study: Study) -> list[Block | None]:
     e, found = study.estimate, verdict(study)
     note = say.intervals(e) if found.holds else f"{say.without(study)}."
     note += f" Method: {METHODS[e.method]}, model '{e.plant.name}' ({say.model_reason(study)})."
-    note += f" Known beforehand: {say.prior(e)}." if e.question.prior else ""
+    note += f" Prior: {say.prior(e)}." if e.question.prior else ""
     walks = say.random_walks(e.bench.machine, e.process_noise, e.load_noise)
     note += "".join(f" Disturbance: {walk}." for walk in walks)
     bias = "the method's bias" if found.biased else "the error of a wrong model"
@@ -298,7 +301,7 @@ def _parameters(study: Study) -> list[Block | None]:
 
 
 def _signature(study: Study) -> Facts:
-    """Lines to be signed; temperature and supply as the nodes sent them, the mean of the runs."""
+    """Lines to be signed, with temperature and supply by the nodes, means of the runs."""
     logs, told = [run.log.conditions for run in study.reported], list[str]()
     for name, condition in CONDITIONS.items():
         if values := [one[name] for one in logs if name in one]:
@@ -307,7 +310,7 @@ def _signature(study: Study) -> Facts:
 
 
 def _notable(c: Conclusion) -> bool:
-    """Returns True if there is more to say than the value, its interval, and that it is identified."""
+    """Returns True for a parameter with doubts, trade-offs or a drift."""
     drifted = c.drift is not None and c.drift.drifted
     return bool(c.finding.doubts or c.finding.traded_with) or drifted
 
@@ -368,14 +371,14 @@ def _evidence(study: Study) -> Iterator[Section]:
 
 
 def _runs_in_full(report: Report, motions: Sequence[Motion], drawn: Sequence[Sequence[Panel]]) -> Iterator[Section]:
-    """Evidence of each run: folded by itself, or inside the fold of its run."""
+    """Evidence of each run; of several runs folded into one section for each."""
     if len(motions) == 1:
         yield from _of_run(motions[0])
         return
     for n, (motion, panels) in enumerate(zip(motions, drawn, strict=True), 1):
-        own = motion.run.alone if report.study.side_by_side else None
-        parts = [*(() if own is None else _evidence(own)), *_of_run(motion)]
-        first = _motion(motion, panels) if panels and own is None else None
+        alone = motion.run.alone if report.study.side_by_side else None
+        parts = [*(() if alone is None else _evidence(alone)), *_of_run(motion)]
+        first = _motion(motion, panels) if panels and alone is None else None
         inside = (replace(part, name=f"run-{n}-{part.name}", level=4, folded=False) for part in parts)
         yield Section(f"run-{n}", f"Run {n}: {motion.run.name}", [first, *inside], 3, folded=True)
 
@@ -393,16 +396,16 @@ def _of_run(motion: Motion) -> Iterator[Section]:
 
 def _excitation(motion: Motion) -> list[Block | None]:
     x = motion.run.experiment
-    said = "The node applied the sent current in every period."
+    summary = "The node applied the sent current in every period."
     if not figures.applied_as_sent(motion):
-        said = "In some periods the node did not apply the sent current, or its report was lost."
+        summary = "In some periods the node did not apply the sent current, or its report was lost."
     if x is not None and x.quality.braked:
-        said += f" {x.quality.braked} periods were braked by the node itself, because no command came in time."
+        summary += f" The node braked in {x.quality.braked} periods, because no command came in time."
     if x is not None and x.quality.command_delay:
-        said += f" Commands acted {x.quality.command_delay} samples late by the node's reports."
+        summary += f" Commands acted {x.quality.command_delay} samples late by the node's reports."
     marks = "The bars below the current mark periods in which the sent current differs from the requested one:"
     reasons = [f"{str(reason.name).lower()}: {words}" for reason, words in REASONS.items()]
-    return [Text(said), Text(marks), Items(reasons)]
+    return [Text(summary), Text(marks), Items(reasons)]
 
 
 def intervals(t: Timing) -> Table | None:
@@ -421,7 +424,7 @@ def intervals(t: Timing) -> Table | None:
 
 def _timing(t: Timing, table: Table) -> list[Block | None]:
     simulated = "The time is simulated: these are not the times of a computer or a bus."
-    obeyed = "not known" if t.not_obeyed is None else f"{t.not_obeyed} commands, by the node's reports"
+    obeyed = "not reported" if t.not_obeyed is None else f"{t.not_obeyed} commands, by the node's reports"
     rows: list[tuple[str, Words]] = [
         ("periods missed", f"{t.missed}, no sample came"),
         ("unanswered", f"{t.unanswered} samples"),
@@ -435,7 +438,7 @@ def _timing(t: Timing, table: Table) -> list[Block | None]:
 
 
 def _safety(motion: Motion) -> list[Block | None]:
-    """Extremes, events of the safety chain, and the worst that a loss of all commands would do."""
+    """Extremes, events of the safety chain, and the worst case of a loss of all commands."""
     log, cycles, limits = motion.run.log, motion.cycles, motion.bench.limits
     rows: list[tuple[str, Words]] = []
     if cycles is not None and (top := cycles.largest) is not None:
@@ -498,10 +501,10 @@ def _log(run: StudiedRun) -> Iterator[Block]:
     log, x = run.log, run.experiment
     missing = [log.missing] if log.missing else []
     missing += [] if x is None else lacks(x)
-    whole = Cell("complete: closed properly, every checksum right", "good")
+    complete = Cell("complete: closed properly, every checksum right", "good")
     rows: list[tuple[str, Words]] = [
         ("file", Cell(str(log.path), "code")),
-        ("completeness", whole if log.complete else Cell("NOT complete", "bad")),
+        ("completeness", complete if log.complete else Cell("NOT complete", "bad")),
         ("missing", "; ".join(missing) or "nothing"),
         ("exit reason", log.exit_reason),
     ]
@@ -521,7 +524,7 @@ def _log(run: StudiedRun) -> Iterator[Block]:
 
 
 def with_units(entries: Mapping[str, str]) -> list[tuple[str, str]]:
-    """Metadata of a log, numbers that have a unit with it and to four digits; others may be serial numbers."""
+    """Metadata of a log; numbers with a unit to four digits, others may be serial numbers and stay."""
     found = []
     for name, text in entries.items():
         with suppress(ValueError):
@@ -540,10 +543,10 @@ def _words(study: Study | None) -> list[Block | None]:
 
 
 def _tested(report: Report) -> tuple[Facts, Table | None]:
-    """Device, conditions, versions and hashes, as the logs have them: what all runs share, and a table of the rest."""
+    """Device, conditions, versions and hashes: those that all runs share, and a table of the others."""
     runs = report.study.runs
     columns = [_identity(run, report.bench) for run in runs]
-    alike = {name: len({own[name] for own in columns}) == 1 for name in columns[0]}
+    alike = {name: len({column[name] for column in columns}) == 1 for name in columns[0]}
     facts = [(name, columns[0][name]) for name, same in alike.items() if same]
     facts += [("evaluated by", report.made_by), ("report number", report.number)]
     shared = Facts([(name, code(value) if "SHA" in name else value) for name, value in facts])
@@ -552,8 +555,8 @@ def _tested(report: Report) -> tuple[Facts, Table | None]:
         return shared, None
     cut = [SHORT_HASH if "SHA" in name else LONGEST for name in names]
     rows = [
-        [run.name, *(own[name][:most] for name, most in zip(names, cut, strict=True))]
-        for run, own in zip(runs, columns, strict=True)
+        [run.name, *(column[name][:most] for name, most in zip(names, cut, strict=True))]
+        for run, column in zip(runs, columns, strict=True)
     ]
     title = f"Of each SHA-256 the first {SHORT_HASH} digits; the evidence has all"
     return shared, Table(title, ["run", *names], rows, words=range(len(names) + 1))
@@ -599,7 +602,7 @@ def document(report: Report) -> dict[str, Any]:
     """JSON document with the content of the page; numbers may be infinite."""
     study = report.study
     estimated = study.joint is not None
-    owns = study.side_by_side or [study] * len(study.runs)
+    studies = study.side_by_side or [study] * len(study.runs)
     found: dict[str, Any] = to_json(
         {
             "number": report.number,
@@ -612,7 +615,7 @@ def document(report: Report) -> dict[str, Any]:
             "left_out": [{"log": path, "why": why} for path, why in report.left_out],
             "estimate": estimate_document(study) if estimated else None,
             "compared": study.side_by_side[1].checks.drifts if study.side_by_side else None,
-            "runs": [_run_document(run, own) for run, own in zip(study.runs, owns, strict=True)],
+            "runs": [_run_document(run, one) for run, one in zip(study.runs, studies, strict=True)],
         }
     )
     return found
@@ -633,7 +636,7 @@ def _run_document(run: StudiedRun, study: Study) -> dict[str, Any]:
             "planned": x.quality.planned,
             "command_delay": x.quality.command_delay,
             "missing": lacks(x),
-            "notes": taken_for_acted(x),
+            "notes": assumed_currents(x),
             "periods": len(x.currents),
             "measured": x.measured.sum(),
             "braked_periods": x.quality.braked,

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from emb_bench.rerun import Rerun
 
 UNITS = ((1.0, "s"), (1e3, "ms"), (1e6, "µs"))  # Of times, with their factors
-SHOWN_DIFFERENCES = 10  # Unless all are asked for
+SHOWN_DIFFERENCES = 10  # Without --verbose
 
 
 def info(d: Mapping[str, Any], *, verbose: bool = False) -> str:
@@ -84,7 +84,7 @@ def _between(name: str, ends: Mapping[str, float]) -> str:
 
 
 def _listed(title: str, entries: Mapping[str, str]) -> list[str]:
-    return ["", title, *(f"  {name:24} {said}" for name, said in entries.items())]
+    return ["", title, *(f"  {name:24} {text}" for name, text in entries.items())]
 
 
 class RunTiming(NamedTuple):
@@ -104,7 +104,7 @@ class RunTiming(NamedTuple):
 
 
 def run_timing(log: RunLog) -> RunTiming:
-    """Timing of a run beside the budgets of its own bench."""
+    """Timing of a run, and the budgets of the bench in its log."""
     t = timing(log)
     budgets = log.bench.budgets
     if t.simulated:
@@ -138,13 +138,13 @@ def timing_text(entry: RunTiming, *, verbose: bool = False) -> str:
         verdict = f"NOT MET: {len(missed)} of {len(entry.checks)} budgets ({', '.join(one.name for one in missed)})"
     else:
         verdict = f"met: all {len(entry.checks)} budgets"
-    obeyed = "commands not obeyed: not known" if t.not_obeyed is None else f"{t.not_obeyed} commands not obeyed"
+    obeyed = "commands not obeyed: not reported" if t.not_obeyed is None else f"{t.not_obeyed} commands not obeyed"
     answers = f"{len(t.response)} answered, {t.unanswered} unanswered, {t.missed} periods missed, {obeyed}"
     lines = listed("WARNING: ", [entry.log.missing])
     lines += [*wrapped(f"{entry.log.path}: {verdict}"), *facts(("samples", f"{t.samples}, {answers}"))]
     if t.simulated:
         return "\n".join(lines)
-    rows = [_row(said, list(quantiles(t.interval(name)).values())) for name, said in INTERVALS.items()]
+    rows = [_row(label, list(quantiles(t.interval(name)).values())) for name, label in INTERVALS.items()]
     lines += ["", *Table("", ("", *QUANTILE_NAMES, "unit"), rows, words=(0, len(QUANTILE_NAMES) + 1)).lines()]
     shown = entry.checks if verbose else missed
     rows = [
@@ -161,12 +161,12 @@ def _check(check: BudgetCheck, value: float | None) -> str:
     return percent(value) if check.name in COUNTED else seconds(value)
 
 
-def _row(said: str, values: list[float]) -> list[str]:
+def _row(label: str, values: list[float]) -> list[str]:
     """Quantiles of an interval, all in the unit that suits the largest."""
     if not values:
-        return [said, *[NOTHING] * len(QUANTILE_NAMES), ""]
+        return [label, *[NOTHING] * len(QUANTILE_NAMES), ""]
     factor, unit = next(((f, u) for f, u in UNITS if max(map(abs, values)) * f >= 1.0), UNITS[-1])
-    return [said, *(f"{factor * value:.4g}" for value in values), unit]
+    return [label, *(f"{factor * value:.4g}" for value in values), unit]
 
 
 def rerun_document(again: Rerun) -> dict[str, Any]:
@@ -203,7 +203,7 @@ def rerun_text(again: Rerun, *, verbose: bool = False) -> str:
     elif again.followed:
         lines.append("outcome      none: the log ends before the run does, and was followed up to there")
     else:
-        lines.append("outcome      none: the loop went another way than the log, the last difference says where")
+        lines.append("outcome      none: the loop diverged from the log at the last difference")
     for difference in again.differences[:shown]:
         where = "" if difference.step is None else f"step {difference.step}, "
         lines.append(f"  {where}{difference.what}: recorded {difference.recorded}, came {difference.came}")

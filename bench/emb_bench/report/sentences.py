@@ -29,7 +29,7 @@ from emb_bench.experiment.experiment import Lack
 from emb_bench.information.evaluation import default_model
 from emb_bench.information.identifiability import Doubt
 from emb_bench.numbers import amount, p_value, percent
-from emb_bench.report.information import DOUBTS, doubts, lacks, taken_for_acted, trade_offs
+from emb_bench.report.information import DOUBTS, assumed_currents, doubts, lacks, trade_offs
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.numbers import between, in_percent, plain
 from emb_runtime.system.terminal import one_line
@@ -39,7 +39,7 @@ INTERVALS = (
     "that the record cannot exclude."
 )
 
-NOISE_ALONE = "± repeatability (95 %, k=2), by sensor noise alone: no systematic or other error is allowed for."
+NOISE_ALONE = "± repeatability (95 %, k=2), by sensor noise alone, without systematic or other errors."
 
 TERMS = {
     "sigma": "standard deviation",
@@ -54,35 +54,34 @@ TERMS = {
 
 
 LONGEST_NAME = 80  # Characters of a name from another file
-EXPLAINS = 3.0  # Standard deviations from which on a parameter that is held fixed may explain a misfit
 
 
 def without(study: Study) -> str:
-    """Kind of the intervals of a model that does not hold, and the error that is not in them."""
+    """Heading of the intervals of a model that does not hold, with the error that they lack."""
     return f"± total (95 %, k=2), without the {'bias of the method' if verdict(study).biased else 'error of the model'}"
 
 
 def intervals(e: Estimate) -> str:
-    """Sentence on the intervals of a model that holds."""
+    """Sentence on the intervals of a right model."""
     if not (e.question.systematic or e.validation.budget):
         return NOISE_ALONE
     return INTERVALS.replace("systematic errors and ", "") if e.ideal_sensors else INTERVALS
 
 
 def effects(machine: Machine | None) -> dict[str, str]:
-    """Effects of the score tests and of the uncertainty budget by the names that are shown, each in a line."""
-    said = {name: row.effect.removesuffix(",") for name, row in EFFECTS.items()}
+    """Effects of the score tests and the uncertainty budget, a line each, by their names in the output."""
+    lines = {name: row.effect.removesuffix(",") for name, row in EFFECTS.items()}
     for parameter in PARAMETER_NAMES:
         for name in (parameter, f"{parameter}_drift"):
-            said[name] = said[name].replace(parameter, quantity(machine, parameter).name)
-    return {shown_as(Contribution(name, ()), machine).name: line for name, line in said.items()}
+            lines[name] = lines[name].replace(parameter, quantity(machine, parameter).name)
+    return {shown_as(Contribution(name, ()), machine).name: line for name, line in lines.items()}
 
 
 # ---- the verdict on a study ----
 
 
 def simulated(study: Study) -> str:
-    """That values are not those of a real machine; empty if no log says so."""
+    """Sentence on simulated runs; empty without any."""
     marked = [(run.name, run.log.simulated) for run in study.reported if run.log.simulated]
     if not marked:
         return ""
@@ -105,8 +104,8 @@ def headline(study: Study) -> str:
         Code.BIASED_METHOD: f"NOT JUDGED: recursive least squares does not reproduce the record (chi2/n "
         f"{plain(m.ratio)}). Noise biases its values; the model is not tested. Use --method oem.",
         Code.DOES_NOT_FIT: f"THE MODEL '{name}' DOES NOT FIT{size}: the intervals do not include its error.",
-        Code.DOES_NOT_PREDICT: f"THE MODEL '{name}' DOES NOT PREDICT other records: the values hold only for their own "
-        "records.",
+        Code.DOES_NOT_PREDICT: f"THE MODEL '{name}' DOES NOT PREDICT other records: the values hold only for the "
+        "records of the estimate.",
         Code.NOT_IDENTIFIED: f"The model '{name}' fits. NOT identified: {missed}"
         f"{'; the values of the others may be used' if others else ''}.",
         Code.FITS: f"The model '{name}' fits. All parameters are identified: the values may be used.",
@@ -123,17 +122,17 @@ def compared(studies: Sequence[Study]) -> str:
     """Verdict on each of two runs side by side, and the parameters in which they differ."""
     changes = [d for d in studies[1].checks.drifts if d.drifted]
     differ = "; ".join(f"{d.name} {drift(d)}" for d in changes) or "No parameter differs significantly"
-    return f"{'; '.join(f'{own.names[0]}: {verdict(own).code.value}' for own in studies)}. {differ}."
+    return f"{'; '.join(f'{one.names[0]}: {verdict(one).code.value}' for one in studies)}. {differ}."
 
 
 def stopped(stop: Stop) -> str:
-    """That a run did not come to its planned end, and why."""
+    """Sentence on the end of a stopped run."""
     after = f" after {stop.periods} of {stop.planned} samples" if stop.planned else ""
     return f"STOPPED: {stop.log}{after} ({stop.reason}){f': {stop.detail}' if stop.detail else ''}"
 
 
 def outside(study: Study, bench: Bench) -> list[tuple[str, str]]:
-    """Parameters outside of the ranges for which the shield guarantees the limits, behind the name of the run."""
+    """Names of runs with sentences on parameters outside of the ranges for which the shield guarantees the limits."""
     found = []
     for name, c in study.outside:
         low, high = c.outside or (math.nan, math.nan)
@@ -147,7 +146,7 @@ def outside(study: Study, bench: Bench) -> list[tuple[str, str]]:
 
 
 def apart(study: Study) -> str:
-    """Parameters in which logs differ that fit alone."""
+    """Parameters that differ between logs that fit alone."""
     values = "; ".join(f"{d.name}: {', '.join(plain(value, 5) for value in d.values)}" for d in study.checks.apart)
     first = study.checks.apart[0].values
     alone, every = sum(map(math.isfinite, first)), len(first)
@@ -156,13 +155,13 @@ def apart(study: Study) -> str:
 
 
 def changed_model(study: Study) -> str:
-    """A warning where a drift may be one of the model instead of one of the brake; else empty."""
+    """A warning that drifts may be the model's, not the brake's; else empty."""
     why = other_model(study.estimate, study.last) if any(d.drifted for d in study.checks.drifts) else ""
     return f"the changes may be the model's: {why}" if why else ""
 
 
 def other_model(now: Estimate, last: Earlier | None) -> str:
-    """Reasons why a change since an earlier estimate may be one of the model; empty if there is none."""
+    """Reasons that a change since an earlier estimate may be the model's; empty without any."""
     if last is None:
         return ""
     reasons = {
@@ -174,46 +173,46 @@ def other_model(now: Estimate, last: Earlier | None) -> str:
 
 
 def missing(study: Study) -> list[str]:
-    """Defects of the logs; that a stopped run ended early is not repeated."""
+    """Defects of the logs, except the early end of a stopped run."""
     found = []
     for log, experiment in zip(study.logs, study.estimate.experiments, strict=True):
-        said = [log.missing] if log.missing else []
+        defects = [log.missing] if log.missing else []
         stopped = log.end.get("exit_reason", DONE) != DONE
-        said += lacks(experiment, but=(Lack.ENDS_EARLY,) if stopped else ())
+        defects += lacks(experiment, but=(Lack.ENDS_EARLY,) if stopped else ())
         lost = int((~experiment.measured).sum()) - experiment.outliers
         if lost and study.estimate.method in WITHOUT_GAPS:
-            said.append(
-                f"what acted in {lost} periods is assumed, for this method does not estimate it: the command, or the "
-                "node's braking where there was none; the right model may not fit"
+            defects.append(
+                f"this method does not estimate the currents of {lost} periods without report: it assumes the command, "
+                "or the node's braking without one; the right model may not fit"
             )
-        found.append(said)
+        found.append(defects)
     return _of_which(study, found)
 
 
 def assumptions(study: Study) -> list[str]:
-    """Assumptions about the currents that acted, where they are not those that were reported."""
-    return _of_which(study, [taken_for_acted(experiment) for experiment in study.estimate.experiments])
+    """Assumptions about the applied currents that are not the reported ones."""
+    return _of_which(study, [assumed_currents(experiment) for experiment in study.estimate.experiments])
 
 
 def _of_which(study: Study, found: Sequence[Sequence[str]]) -> list[str]:
-    """Texts of each log, behind its name if there are several."""
+    """Texts of each log, after its name if there are several."""
     several = len(study.logs) > 1
-    names = study.names
-    return [f"{name}: {text}" if several else text for name, own in zip(names, found, strict=True) for text in own]
+    pairs = zip(study.names, found, strict=True)
+    return [f"{name}: {text}" if several else text for name, texts in pairs for text in texts]
 
 
 def model_reason(study: Study) -> str:
     """Reason for the model."""
     choice = study.checks.choice
     if choice is None:
-        return "asked for" if study.options.model else default_model(study.logs[0])[1]
+        return "as requested" if study.options.model else default_model(study.logs[0])[1]
     why = f"the best of {len(choice.candidates)}"
-    same = f"; {', '.join(choice.same)} left out: one of them, with the encoder's offset estimated too"
+    same = f"; {', '.join(choice.same)} not ranked: equal to another one with an estimated encoder offset"
     return why + same if choice.same else why
 
 
 def models(study: Study) -> str:
-    """Models that the experiments do not tell apart; empty if one is left."""
+    """Models that the experiments do not separate; empty with one plausible model."""
     choice = study.checks.choice
     found: Sequence[Candidate] = choice.plausible if choice is not None else ()
     if choice is None or len(found) < 2:
@@ -238,16 +237,16 @@ def limit(effect: Contribution, e: Estimate) -> str:
 
 
 def alarms(e: Estimate) -> list[str]:
-    """Reasons for which the model does not fit, an effect that explains it first; empty if it may fit."""
+    """Reasons that the model does not fit, the cause first; empty if it fits."""
     m, scored = e.validation, any(name.startswith("score of") for name in e.validation.alarming)
     found = [] if m.fits else faults(e)
     if found:
         pass
     elif m.cause is not None and m.cause.suspect.observer:
         found.append(explained(m.cause, e.bench.machine))
-    elif left := left_fixed(e):
-        names = ", ".join(left)
-        one = f"{names}, which is held fixed," if len(left) == 1 else f"one of {names}, which are held fixed,"
+    elif fixed := fixed_parameters(e):
+        names = ", ".join(fixed)
+        one = f"{names}, which is fixed," if len(fixed) == 1 else f"one of {names}, which are fixed,"
         found.append(f"{one} may explain it; remedy: estimate {_every(e)}: leave --params out")
     elif m.cause is not None:
         found.append(_cause(m.cause, e))
@@ -258,7 +257,7 @@ def alarms(e: Estimate) -> list[str]:
         found.append(f"the model lacks several effects together ({score})")
     depends = [name for name in m.independence if f"current of {name}" in m.alarming]
     if "size" in m.alarming:
-        no_pattern = ", without any pattern: the noise may be larger than the bench says"
+        no_pattern = ", without any pattern: the noise may be larger than in the bench file"
         why = "" if depends or m.coloured or scored else no_pattern
         found.append(
             f"the residuals are too large: chi2/n {plain(m.ratio, 4)}, at most {m.expected[1]:.3f} expected{why}"
@@ -276,13 +275,13 @@ def alarms(e: Estimate) -> list[str]:
 
 def _cause(cause: Cause, e: Estimate) -> str:
     """The effect that explains a misfit, or most of it, and what else to look for."""
-    said = explained(cause, e.bench.machine)
-    said += _window(e) if "--nuisance" in said else ""
-    return said if cause.possible else f"{said}; or look for a fault in the data"
+    sentence = explained(cause, e.bench.machine)
+    sentence += _window(e) if "--nuisance" in sentence else ""
+    return sentence if cause.possible else f"{sentence}; or look for a fault in the data"
 
 
 def _window(e: Estimate) -> str:
-    """Option with which a recording has windows enough for two unknowns more; empty where it has, or has none."""
+    """Option for enough windows with two more unknowns; empty if there are enough, or no windows."""
     machine, needed = e.bench.machine, FEWEST_WINDOWS * (len(e.unknowns) + 2)
     if machine is None or not 0 < e.windows < needed:
         return ""
@@ -295,12 +294,10 @@ def faults(e: Estimate) -> list[str]:
     return [fault for experiment in e.experiments for fault in experiment.quality.faults]
 
 
-def left_fixed(e: Estimate) -> list[str]:
-    """Parameters that ``--params`` leaves fixed, and that may each explain a misfit; most suspicious first."""
-    machine, m = e.bench.machine, e.validation
-    usual = PARAMETER_NAMES if machine is None else machine.unknown
-    found = [s.name for s in m.suspects if s.name in usual and abs(s.sigmas) >= EXPLAINS]
-    return [] if m.fits else [quantity(machine, name).name for name in found]
+def fixed_parameters(e: Estimate) -> list[str]:
+    """Parameters without an estimate, each of which may explain a misfit; most significant first."""
+    cause = e.validation.cause
+    return [] if cause is None else [quantity(e.bench.machine, name).name for name in cause.fixed]
 
 
 def _every(e: Estimate) -> str:
@@ -308,14 +305,14 @@ def _every(e: Estimate) -> str:
 
 
 def residual_notes(e: Estimate) -> list[str]:
-    """Remarks on the residuals that are no reason against the model."""
+    """Remarks on the residuals that do not reject the model."""
     m, found = e.validation, list[str]()
     if m.disturbance is not None:
-        said = " and ".join(random_walks(e.bench.machine, m.disturbance.walk, m.disturbance.load))
+        walks = " and ".join(random_walks(e.bench.machine, m.disturbance.walk, m.disturbance.load))
         found.append(
             f"the {'brake' if e.bench.machine is None else 'machine'} is disturbed by more than the sensors' noise: "
-            f"{said} (likelihood ratio {plain(m.disturbance.ratio, 4)}, {p_value(m.disturbance.p_value)}); the "
-            "intervals allow for it"
+            f"{walks} (likelihood ratio {plain(m.disturbance.ratio, 4)}, {p_value(m.disturbance.p_value)}); the "
+            "intervals include it"
         )
     if m.ratio < m.expected[0]:
         found.append(
@@ -331,14 +328,14 @@ def residual_notes(e: Estimate) -> list[str]:
 
 
 def random_walks(machine: Machine | None, velocity: float, load: float) -> list[str]:
-    """Random walks of a disturbed machine, of its velocity and of its load; those of size 0 are left out."""
+    """Random walks of a disturbed machine, of its velocity and of its load, except those of size 0."""
     found, command = list[str](), quantity(machine, "current")
     if velocity > 0.0:
         unit = quantity(machine, "velocity").unit
-        found.append(f"its velocity does a random walk of {plain(velocity)} {unit} per root of a second")
+        found.append(f"its velocity has a random walk of {plain(velocity)} {unit} per root of a second")
     if load > 0.0:
         size = f"{plain(load)} {command.unit}".removesuffix(" 1")
-        found.append(f"its load does a random walk, that of a {command.name} of {size} per root of a second")
+        found.append(f"its load has a random walk, that of a {command.name} of {size} per root of a second")
     return found
 
 
@@ -351,21 +348,21 @@ def _coloured(m: ModelValidation) -> str:
 
 
 def explained(cause: Cause, machine: Machine | None = None) -> str:
-    """A cause in words that lead to the remedy; ``machine`` is that of a bench that has no brake.
+    """A cause with its remedy; ``machine`` is that of a bench without a brake.
 
-    Its amount is left out where the effect leaves a misfit: of first order, it says little there.
+    With the amount only if the effect explains the misfit: a linear score test does not size others.
     """
     s = cause.suspect
     if s.observer:
         return derived_velocity(s.observer, machine)
     effect, unit = EFFECTS[s.name], shown_as(s, machine).unit
-    said, is_part = effect.effect, cause.share is not None and cause.share < 1.0
+    name, is_part = effect.effect, cause.share is not None and cause.share < 1.0
     for parameter in PARAMETER_NAMES:
-        said = said.replace(parameter, quantity(machine, parameter).name)
+        name = name.replace(parameter, quantity(machine, parameter).name)
     if cause.is_curve:
-        said = "a stiffness with a quadratic and a cubic term"
-    elif s.possible and not is_part:
-        said += f" of about {plain(s.value, 2)} {unit}" if unit else f" of about {in_percent(s.value)}"
+        name = "a stiffness with a quadratic and a cubic term"
+    elif s.possible and cause.share == 1.0:
+        name += f" of about {plain(s.value, 2)} {unit}" if unit else f" of about {in_percent(s.value)}"
     remedy = effect.remedy
     if machine is not None and "--model" in remedy:  # the plant of a recording is that of its map
         remedy = "leave [signals.velocity] out of the map"
@@ -373,19 +370,19 @@ def explained(cause: Cause, machine: Machine | None = None) -> str:
         does = "is the most significant"
     else:
         does = f"explains {percent(cause.share)} of it" if is_part else "explains it"
-    return f"{said} {does} ({cause.sigmas:.0f} sigma); remedy: {remedy}"
+    return f"{name} {does} ({cause.sigmas:.0f} sigma); remedy: {remedy}"
 
 
 def derived_velocity(observer: Derived, machine: Machine | None) -> str:
     """An observer that is not declared; ``machine`` as for :func:`explained`."""
     best, least, declared = (float(f"{w:.2g}") for w in (observer.bandwidth, observer.least, 0.9 * observer.least))
-    known = f"about {best:g}" if observer.is_known else f"at least {least:g}"
+    bandwidth = f"about {best:g}" if observer.is_known else f"at least {least:g}"
     remedy = (
         f'declare it ([sensors] velocity = "observer", observer_bandwidth = {declared:g}) in a bench file: --bench FILE'
         if machine is None
         else "leave its column out of the map"
     )
-    return f"the velocity is derived from the angle, bandwidth {known} rad/s: {remedy}"
+    return f"the velocity is derived from the angle, bandwidth {bandwidth} rad/s: {remedy}"
 
 
 # ---- parameters ----
@@ -399,13 +396,13 @@ def conclusion(c: Conclusion) -> str:
 
 
 def clamping(study: Study) -> str:
-    """Clamping force, the current that holds it and its friction band; empty where they are not known."""
+    """Clamping force, the current that holds it and its friction band; empty if a parameter is not identified."""
     if (found := study.clamping) is None:
         return ""
     _, force, current, friction = found
-    known, band = (in_percent(one.total / one.value) for one in (force, friction))
+    total, band = (in_percent(one.total / one.value) for one in (force, friction))
     return (
-        f"clamping    force known to {known}: {amount(*force.with_interval)} at {plain(found.angle)} rad, held by "
+        f"clamping    force known to {total}: {amount(*force.with_interval)} at {plain(found.angle)} rad, held by "
         f"{amount(*current.with_interval)}; friction band ± {plain(friction.value)} N, known to {band}"
     )
 
@@ -435,25 +432,25 @@ def held_out(h: HeldOut) -> str:
 
 
 def profile(p: Profile, e: Estimate) -> str:
-    """Interval of a likelihood profile beside that of the Fisher information; in the units that are shown."""
+    """Interval of a likelihood profile, compared with that of the Fisher information."""
     (low, high), fisher = p.interval, p.fisher
-    shown = e.quantities[e.labels.index(p.label)].unit
-    unit = "" if shown == "1" else f" {shown}"
+    name = e.quantities[e.labels.index(p.label)].unit
+    unit = "" if name == "1" else f" {name}"
     if p.doubt is Doubt.CUT:
-        said = DOUBTS[Doubt.CUT]
+        comparison = DOUBTS[Doubt.CUT]
     elif math.isinf(low) and math.isinf(high):
-        said = "flat: the records exclude no value within the search"
+        comparison = "flat: the records exclude no value within the search"
     elif math.isinf(low):
-        said = f"only values above {plain(high, 4)}{unit} are excluded"
+        comparison = f"only values above {plain(high, 4)}{unit} are excluded"
     elif math.isinf(high):
-        said = f"only values below {plain(low, 4)}{unit} are excluded"
+        comparison = f"only values below {plain(low, 4)}{unit} are excluded"
     elif math.isinf(fisher[1]):
-        said = f"{between(low, high)}{unit}; the Fisher information gives no bound"
+        comparison = f"{between(low, high)}{unit}; the Fisher information gives no bound"
     elif p.agrees:
-        said = f"{between(low, high)}{unit}, as the Fisher information says"
+        comparison = f"{between(low, high)}{unit}, as by the Fisher information"
     else:
-        said = f"{between(low, high)}{unit}; the Fisher information says {between(*fisher)}{unit}"
-    found = [said]
+        comparison = f"{between(low, high)}{unit}; by the Fisher information {between(*fisher)}{unit}"
+    found = [comparison]
     if e.method != "oem":
         found.append(f"of output error, whose minimum is at {plain(p.minimum, 6)}{unit}")
     if p.fell:
@@ -470,7 +467,7 @@ def prior(e: Estimate) -> str:
 
 
 def once(study: Study) -> str:
-    """A warning where the best minimum was found by one search of several; else empty."""
+    """A warning that only one of several searches found the best minimum; else empty."""
     found = study.minima
     lonely = len(study.estimate.ends) > 1 and bool(found) and len(found[0]) == 1
     return "the best minimum was found by one search only: use more --starts" if lonely else ""
@@ -495,9 +492,9 @@ def logs_of(study: Study) -> str:
 
 
 def remedies(study: Study, *, stopped: bool) -> list[str]:
-    """Remedies for a model that does not fit or predict, and for parameters that are not identified.
+    """Remedies for a model that does not fit or predict, and for unidentified parameters.
 
-    Where a run was ``stopped`` no further one is named: its cause comes first.
+    If a run was ``stopped``, no further run is suggested.
     """
     e, again = study.estimate, f"emb-replay estimate {logs_of(study)}{_known(study)}"
     if verdict(study).biased:
@@ -512,9 +509,9 @@ def remedies(study: Study, *, stopped: bool) -> list[str]:
         weak = [c.label for c in study.conclusions if not (c.of_interest or c.identified)]
         return [f"estimate without {', '.join(weak)}: not determined by the record"] if weak else [MORE]
     if faults(e):
-        return ["correct the map as the first line says, and estimate again: no value holds before"]
+        return ["correct the map by the first line, and estimate again: no value is usable before"]
     found = []
-    if left_fixed(e):
+    if fixed_parameters(e):
         found.append(f"estimate {_every(e)}: {again}{_options(study)}")
     otherwise = "if that does not fit either, " if found else ""
     if e.bench.machine is None:
@@ -529,13 +526,13 @@ def remedies(study: Study, *, stopped: bool) -> list[str]:
 
 
 def _known(study: Study) -> str:
-    """The option of a study for parameters that are known beforehand, as it was given."""
-    said = ",".join(names_of(study.options.known or ()))
-    return f" --known {said}" if said else ""
+    """The option --known of a study, as given."""
+    given = ",".join(names_of(study.options.known or ()))
+    return f" --known {given}" if given else ""
 
 
 def _options(study: Study) -> str:
-    """Options of a study but those that name unknowns."""
-    wanted, usual = study.options, "oem" if study.estimate.bench.machine is None else "windows"
-    given = {"--method": "" if wanted.method in (None, usual) else wanted.method, "--model": wanted.model or ""}
+    """Options of a study without those that name unknowns."""
+    options, usual = study.options, "oem" if study.estimate.bench.machine is None else "windows"
+    given = {"--method": "" if options.method in (None, usual) else options.method, "--model": options.model or ""}
     return "".join(f" {option} {value}" for option, value in given.items() if value)

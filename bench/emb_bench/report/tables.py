@@ -31,7 +31,7 @@ TONES = {Result.PASS: "good", Result.FAIL: "bad", Result.CANNOT_TELL: "care"}  #
 
 
 def answer(yes: bool, *, good: bool = True) -> Cell:
-    """Yes or no; the one that is not ``good`` stands out."""
+    """Yes or no; the bad one stands out."""
     word = "yes" if yes else "no"
     return Cell(word) if yes is good else Cell(word.upper(), "bad")
 
@@ -53,7 +53,7 @@ def parameters(study: Study, *, brief: bool = False) -> Table:
     e, found = study.estimate, verdict(study)
     header = ["" if brief else "parameter", "value ± total", "total", "repeatability", "identified"]
     if not found.holds:
-        header.remove("repeatability")  # of a wrong model it means nothing
+        header.remove("repeatability")  # it has no meaning for a wrong model
     words = (0, len(header) - 1)
     header += [] if brief else ["from nominal"]
     header += ["simulated", "error in sigma"] if study.truth is not None and not brief else []
@@ -76,7 +76,7 @@ def parameters(study: Study, *, brief: bool = False) -> Table:
 
 
 def _errors(study: Study) -> list[list[str]]:
-    """Of each parameter the value that was simulated, and the error in standard deviations."""
+    """True value of each parameter of a simulated brake, and the error in standard deviations."""
     e, rows = study.estimate, []
     for i, c in zip(e.requested(), study.conclusions, strict=True):
         unknown, true = e.unknowns[i], getattr(study.truth, e.unknowns[i].name, math.nan)
@@ -87,7 +87,7 @@ def _errors(study: Study) -> list[list[str]]:
 
 
 def errors(study: Study) -> Table | None:
-    """Values that were simulated, and the errors; None where they are not known."""
+    """True values of a simulated brake, and the errors; None of a real one."""
     if study.truth is None:
         return None
     rows = [[c.label, *row] for c, row in zip(study.conclusions, _errors(study), strict=True)]
@@ -95,7 +95,7 @@ def errors(study: Study) -> Table | None:
 
 
 def models(study: Study) -> Table | None:
-    """Models that were compared, best first, with what each would change."""
+    """Compared models, best first, with the changes of the parameters."""
     choice = study.checks.choice
     if choice is None:
         return None
@@ -117,7 +117,7 @@ def models(study: Study) -> Table | None:
 
 
 def budget(study: Study) -> Table | None:
-    """Contributions to the uncertainty of each parameter; None where nothing but the noise is allowed for."""
+    """Contributions to the uncertainty of each parameter; None if only the noise counts."""
     if not (study.estimate.question.systematic or study.estimate.validation.budget):
         return None
     e, rows = study.estimate, []
@@ -127,7 +127,7 @@ def budget(study: Study) -> Table | None:
         factor = NORMAL_95 * float(e.scale[i])
         jointly, shared, effects, residuals = (factor * float(column[i]) for column in columns)
         systematic = math.sqrt(max(jointly**2 - c.repeatability**2, 0.0)) if math.isfinite(jointly) else math.inf
-        systematic = systematic if systematic > SMALL * jointly else 0.0  # what is left is rounding
+        systematic = systematic if systematic > SMALL * jointly else 0.0  # below it is rounding
         halves = [c.repeatability, systematic, shared, effects, 0.5 * (c.interval[1] - c.interval[0]), residuals]
         size = c.value if e.unknowns[i].relative else 0.0
         largest = e.largest_bias(i)
@@ -158,15 +158,15 @@ def ratios(e: Estimate) -> Table | None:
 
 
 def clamping(study: Study) -> Table | None:
-    """Clamping force of a brake that is applied; None where it is not known."""
+    """Clamping force of a brake that is applied; None if a parameter is not identified."""
     found = study.clamping
     if found is None:
         return None
     names = {"force": found.force, "current that holds it": found.current, "friction band, ±": found.friction}
     rows = [[name, amount(*one.with_interval), relative(one.total, one.value)] for name, one in names.items()]
     title = (
-        f"Clamping force at {plain(found.angle)} rad from contact. The friction band is by how much the force may "
-        "differ from that of the current while the brake rests; ± is the total (95 %, k=2)"
+        f"Clamping force at {plain(found.angle)} rad from contact. Friction band: largest difference "
+        "between the force and that of the current while the brake rests; ± is the total (95 %, k=2)"
     )
     return Table(title, ["clamping", "value ± total", "total"], rows)
 
@@ -190,13 +190,13 @@ def residual_tests(study: Study) -> Table:
 
 
 def systematic(e: Estimate) -> Table | None:
-    """Systematic errors that were estimated too, with the priors of the bench file."""
+    """Estimated systematic errors, with the priors of the bench file."""
     rows = []
-    for unknown, label, value, own in zip(e.unknowns, e.labels, e.values, e.deviations(), strict=True):
+    for unknown, label, value, deviation in zip(e.unknowns, e.labels, e.values, e.deviations(), strict=True):
         if unknown.name in e.question.default_nuisances and unknown.name in e.question.systematic:
             unit = UNITS[unknown.name].replace("1", "")
             before = e.question.systematic[unknown.name]
-            estimated = around(float(value), NORMAL_95 * float(own))
+            estimated = around(float(value), NORMAL_95 * float(deviation))
             rows.append([label, f"{estimated} {unit}".strip(), f"{plain(before)} {unit}".strip()])
     title = "Systematic errors, estimated with the parameters; ± is the total (95 %, k=2)"
     return Table(title, ["error", "estimate", "sigma in [systematic]"], rows) if rows else None
@@ -229,11 +229,11 @@ def predicted(study: Study) -> Table | None:
         [h.name, plain(h.ratio, 4), str(h.freedom), chance(h.p_value), answer(h.fits)] for h in study.checks.held_out
     ]
     header = ["record", "chi2/n", "samples", "p", "predicted"]
-    return Table("Predictions of records that were held out", header, rows, words=(0, 4)) if rows else None
+    return Table("Predictions of held-out records", header, rows, words=(0, 4)) if rows else None
 
 
 def correlation(e: Estimate) -> tuple[Table | None, list[str]]:
-    """Correlations of the estimates, and the pairs that the records hardly separate; of what all records share."""
+    """Correlations of the shared unknowns, and the pairs that the records hardly separate."""
     index = [i for i in e.shared() if i in e.requested()]
     labels = [e.labels[i] for i in index]
     matrix = e.correlation()[np.ix_(index, index)].tolist()
@@ -248,7 +248,7 @@ def correlation(e: Estimate) -> tuple[Table | None, list[str]]:
 
 
 def compared(studies: Sequence[Study]) -> Table:
-    """Two runs that were estimated alone, in a column each: verdict, parameters, and the change of these."""
+    """Two runs, each estimated alone, in a column each: verdict, parameters and their differences."""
     first, second = studies
     changes, found = {d.name: d for d in second.checks.drifts}, [verdict(first), verdict(second)]
     rows: list[list[str]] = [["verdict", *(Cell(one.code.value, one.tone) for one in found), "", "", ""]]
@@ -257,11 +257,11 @@ def compared(studies: Sequence[Study]) -> Table:
         row: list[str] = [c.label, *(Cell(amount(v.value, v.interval, v.unit), tone) for v, tone in tones)]
         d = changes.get(c.label)
         if d is None or math.isinf(d.detectable):
-            rows.append([*row, NOTHING, NOTHING, Cell("not known", "care")])
+            rows.append([*row, NOTHING, NOTHING, Cell("not compared", "care")])
         else:
             rows.append([*row, _change(d), signed(d.sigmas, "+.1f"), answer(d.drifted, good=False)])
     title = "Value ± total (95 %, k=2); difference: second less first; sigma: in its deviations between runs of a brake"
-    return Table(title, ["", *(own.names[0] for own in studies), "difference", "sigma", "differs"], rows, words=(0, 5))
+    return Table(title, ["", *(one.names[0] for one in studies), "difference", "sigma", "differs"], rows, words=(0, 5))
 
 
 def _change(d: Drift) -> str:

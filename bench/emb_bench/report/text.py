@@ -33,15 +33,15 @@ class Cell(str):
 
 
 def facts(*rows: tuple[str, str]) -> list[str]:
-    """Lines of a name and its text; those with an empty text are left out."""
-    return [line for name, said in rows if said for line in wrapped(f"{name:12} {said}", 13)]
+    """Lines of a name and its text, without empty texts."""
+    return [line for name, text in rows if text for line in wrapped(f"{name:12} {text}", 13)]
 
 
 def wrapped(text: str, indent: int = 4) -> list[str]:
     """A text in lines of at most ``WIDTH`` columns; all but the first begin ``indent`` columns further to the right."""
-    left = len(text) - len(text.lstrip())
-    later, whole = " " * (left + indent), text.replace(" × ", "\xa0×\xa0")  # a power of ten stays with its number
-    lines = textwrap.wrap(whole, WIDTH, subsequent_indent=later, break_long_words=False, break_on_hyphens=False)
+    margin = len(text) - len(text.lstrip())
+    later, joined = " " * (margin + indent), text.replace(" × ", "\xa0×\xa0")  # a power of ten stays with its number
+    lines = textwrap.wrap(joined, WIDTH, subsequent_indent=later, break_long_words=False, break_on_hyphens=False)
     return [line.replace("\xa0", " ") for line in lines] or [""]
 
 
@@ -58,7 +58,7 @@ class Table:
     title: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
-    words: Sequence[int] = (0,)  # Columns of words, set to the left; numbers are set to the right
+    words: Sequence[int] = (0,)  # Columns of words; the others are aligned to the right
 
     def lines(self, indent: str = "") -> list[str]:
         """Aligned lines, without the title."""

@@ -33,7 +33,7 @@ class Trend:
 
     label: str
     less: str  # Reference of the distances, the median of the usable runs; empty for a parameter that is not relative
-    unit: str  # Of the distances: ppm or % of the reference, or the parameter's own
+    unit: str  # Of the distances: ppm or % of the reference, or the parameter's unit
     values: NDArray[np.float64]  # Distances, shape (r,)
     ends: NDArray[np.float64]  # 95 % intervals without errors that the runs share, shape (r, 2)
     usable: NDArray[np.bool_]  # True where the model holds and the run identifies the parameter, shape (r,)

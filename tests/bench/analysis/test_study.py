@@ -190,7 +190,12 @@ def test_the_first_remedy_for_each_choice_of_parameters_is_a_command_that_gives_
         assert all(c.interval[0] in (-np.inf, 0.0) or c.interval[0] > 0.0 for c in study.conclusions)
         assert verdict(study).holds == (name in chosen)
         if not verdict(study).holds:
-            assert name in alarms(study.estimate)[0]
+            cause = document(study)["misfit"]["cause"]
+            assert name in cause["fixed"]
+            assert alarms(study.estimate)[0].startswith(
+                ("one of " if len(cause["fixed"]) > 1 else "") + cause["fixed"][0]
+            )
+            assert cause["suspect"]["name"] == cause["fixed"][0]
             assert alarms(study.estimate)[0].endswith("estimate all four: leave --params out")
             commands.add(remedies(study, stopped=False)[0].partition(": ")[2])
     (command,) = commands

@@ -76,7 +76,7 @@ def test_parameters_are_known_from_a_log_of_a_drive_that_tells_its_current_coars
         assert one.interval[1] - one.interval[0] < 0.06 * getattr(truth, one.label)  # 0.04 by an inertia known to 1 %
     assert [c.label for c in study.conclusions] == list(PARAMETER_NAMES)
     (note,) = assumptions(study)
-    assert f"the command as its bus carried it, {in_samples(late)} late" in note
+    assert f"the command on the bus, {in_samples(late)} late" in note
     assert f"NOTE: {note}" in " ".join(report.text(study).split())
     information = api.fisher_information(log, model="exact")
     assert isinstance(information, Evaluation)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from emb_bench.config.bench import Bench
 from emb_bench.experiment.experiment import Experiment, Floats, planned
 from emb_bench.experiment.simulate import NO_ERRORS, SystematicErrors, Theta, simulate
-from emb_bench.information.evaluation import Fit, information_and_fit
+from emb_bench.information.evaluation import Fit, Question, expected, information_and_fit
 
 FINE = 20  # Steps of the simulation in a period
 CURRENTS = np.repeat([2.0, -1.5, 1.0, 0.3], 20)
@@ -78,3 +79,14 @@ def test_the_information_about_systematic_errors_is_that_of_finite_differences(b
     expected = np.array(rows) @ np.array(rows).T
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     np.testing.assert_allclose(found / scale, expected / scale, atol=1e-3)
+
+
+@pytest.mark.parametrize("errors", [NO_ERRORS, SystematicErrors(offset=-0.7)])
+def test_a_planned_experiment_begins_at_the_origin_whatever_the_encoder_reads_there(
+    bench: Bench, errors: SystematicErrors
+) -> None:
+    exact = bench.plant("exact")
+    shifted = replace(exact, instruments=exact.instruments._replace(encoder_offset=0.4))
+    found, right = (expected(bench, one, Question(), bench.brake, errors, CURRENTS) for one in (shifted, exact))
+    assert found.trajectory.states.tolist() == right.trajectory.states.tolist()
+    assert found.matrix.tolist() == right.matrix.tolist()

@@ -20,7 +20,7 @@ from emb_bench.cli.replay import main
 from emb_bench.config.bench import load_bench
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.logs.log import read_log
-from emb_bench.report.acceptance import judge, read_criteria
+from emb_bench.report.acceptance import accept, read_criteria
 from emb_bench.report.estimate import document
 from emb_runtime.errors import UsageError
 
@@ -60,7 +60,7 @@ def written(tmp_path: Path, text: str) -> Path:
 
 
 def results(tmp_path: Path, text: str, study: Study) -> dict[str, Result]:
-    found = judge(read_criteria(written(tmp_path, text)), "criteria.toml", study, [])
+    found = accept(read_criteria(written(tmp_path, text)), "criteria.toml", study, [])
     assert all(bool(one.why) == (one.result is not Result.PASS) for one in found.results)
     return {one.name: one.result for one in found.results}
 
@@ -146,7 +146,7 @@ def test_a_stopped_run_or_a_log_that_is_not_whole_fails_whatever_the_model_says(
         replace(log, complete=False, missing="cut"),
     ):
         assert results(tmp_path, "", with_run(study, log=other))["run completed"] is Result.FAIL
-    left_out = judge(read_criteria(written(tmp_path, "")), "criteria.toml", study, ["x.mcap: left out: no log"])
+    left_out = accept(read_criteria(written(tmp_path, "")), "criteria.toml", study, ["x.mcap: left out: no log"])
     assert left_out.result is Result.FAIL
 
 

@@ -288,7 +288,7 @@ def test_metadata_has_four_digits_and_units(report: Report) -> None:
     ],
 )
 def test_an_axis_of_a_profile_needs_no_power_of_ten(unknown: str, farthest: float, expected: tuple[float, str]) -> None:
-    e = SimpleNamespace(unknowns=[Unknown(unknown)], scale=np.array([0.02]), shown=[quantity(None, unknown)])
+    e = SimpleNamespace(unknowns=[Unknown(unknown)], scale=np.array([0.02]), quantities=[quantity(None, unknown)])
     factor, unit = figures.axis_unit(cast("Estimate", e), 0, farthest)
     assert factor == pytest.approx(expected[0])
     assert unit == expected[1]
