@@ -21,6 +21,7 @@ def tree(tmp_path: Path) -> Path:
     for name, text in {
         TABLES: "# Promises\n\n## docs/explanation/a.md\n\n| promise | test |\n|---|---|\n" + ROW + README,
         "docs/explanation/a.md": PAGE,
+        "docs/howto/b.md": "Nothing else.\n",
         "SECURITY.md": SECURITY,
         "README.md": "## Safety\n\n[One run, state by state]\n\nEach run first stops.\n\n[Some sensor",
         "Makefile": "night:\n\tpython -m tests.searches.b\n",
@@ -36,6 +37,7 @@ def tree(tmp_path: Path) -> Path:
     ("name", "old", "new", "said"),
     [
         ("docs/explanation/a.md", "Nothing else.", "It always stops.", "a promise without a test"),
+        ("docs/howto/b.md", "Nothing else.", "It always stops.", "a promise without a test"),
         ("docs/explanation/a.md", "and so on", "or so", "does not say"),
         ("SECURITY.md", ":\n\n|", ":\n\n- It stops.\n\n|", "a promise without a test"),
         ("tests/test_a.py", "test_a", "test_b", "neither pytest nor make night runs"),
