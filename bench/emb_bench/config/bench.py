@@ -67,7 +67,7 @@ class _Tables(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Bench(driven.Bench):
-    """Everything that is known about one bench."""
+    """One bench: what is driven, and the tables of simulation and analysis."""
 
     budgets: Budgets | None  # Timing budgets of a run; None if the file has none
     plants: Mapping[str, Plant]
@@ -78,8 +78,8 @@ class Bench(driven.Bench):
         try:
             return self.plants[name]
         except KeyError:
-            known = f"{', '.join(self.plants)}{near(name, self.plants)}"
-            raise BenchFileError(f"no plant is called {name!r}; this bench has: {known}") from None
+            names = f"{', '.join(self.plants)}{near(name, self.plants)}"
+            raise BenchFileError(f"no plant is called {name!r}; this bench has: {names}") from None
 
     def model(self, name: str) -> Plant:
         """The named brake as a record of this bench is evaluated: behind the observer that ``[sensors]`` declares."""

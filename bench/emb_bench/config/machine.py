@@ -27,7 +27,7 @@ COMMANDS: Mapping[str, str] = {"A": "current", "V": "voltage", "1": "command", "
 torque or force has no ``k_m``: it is 1."""
 LOADS = ("Nm", "N")  # Units of a command that has no ``k_m``
 Window = Annotated[float, Meta(ge=1e-3, le=3600)]
-WINDOW = 0.5  # Length of the windows where nothing else says it [s]
+WINDOW = 0.5  # Default length of the windows [s]
 
 
 @dataclass(frozen=True)

@@ -97,14 +97,14 @@ def read_plant(name: str, document: Mapping[str, Any], source: str) -> Plant:
     if name in BUILT_IN:
         raise BenchFileError(f"{at}: this name is taken by the built-in plant")
     if name == EVERY or not _NAME.fullmatch(name):
-        wanted = f"expected a name of 1 to 40 letters, digits, '-' and '_', other than '{EVERY}'"
-        raise BenchFileError(f"{at}: {wanted}")
+        expected = f"expected a name of 1 to 40 letters, digits, '-' and '_', other than '{EVERY}'"
+        raise BenchFileError(f"{at}: {expected}")
     solver = document.get("solver", "exact")
     if solver not in SOLVERS:
         raise BenchFileError(f"{at}.solver: expected one of {', '.join(SOLVERS)}, got {shown(solver)}")
-    known = {*Mechanics._fields, *Instruments._fields}
-    if unknown := [key for key in document if key not in known]:
-        expected = f"expected some of {', '.join(sorted(known))}{near(unknown[0], known)}"
+    keys = {*Mechanics._fields, *Instruments._fields}
+    if unknown := [key for key in document if key not in keys]:
+        expected = f"expected some of {', '.join(sorted(keys))}{near(unknown[0], keys)}"
         raise BenchFileError(f"{at}.{key_text((unknown[0],))}: unknown key; {expected}")
     features = {key: value for key, value in document.items() if key in Mechanics._fields}
     features["solver"] = SOLVERS.index(solver)

@@ -1,11 +1,11 @@
 """Faults of a recording and its map, looked for before anything is estimated: each a row of a table.
 
-Times that make no grid, an angle that begins anew and special values are refused, with the row of the file. What
-contradicts the equations of the machine, whatever its friction is, is kept, and named first where the model does not
-fit. Pure: of arrays and the map.
+Times that make no grid, an angle that begins anew and special values are refused, with the row of the file. A
+contradiction of the equations of motion, which holds for any friction, refuses nothing; it is named first where the
+model does not fit. Pure functions of arrays and the map.
 
-The equations are taken over spans of a few samples, as second differences of the angle and of the double integrals of
-what acts: they are exact for any course between the samples, and linear in all that is unknown.
+The equations are those of spans of a few samples: second differences of the angle against those of the double integral
+of the torque. They are exact for any motion between the samples, and linear in the parameters.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ ALIKE = 0.05  # Relative difference of jumps of one period
 PERIODS = (*(2.0 * math.pi / n for n in range(1, 13)), *(2.0**bits for bits in range(8, 33)))
 """Usual ones besides those of two digits, which a jump says less exactly."""
 SPANS = (5, 10, 20, 40)  # Samples of a span: the shortest whose changes the noise does not hide
-TOLD = 30.0  # Change over a span, in standard deviations of the sensor
+SIGNIFICANT = 30.0  # Least change over a span, in standard deviations of the sensor
 MOST = 100_000  # Samples that the equations are tried on
 LATEST = 100  # Largest delay that is looked for [samples], in a recording that is ten times as long
 EARLY, LATE = -0.1, 0.9  # Delays that can be estimated [samples]
 BETTER = 0.5  # Share of the squares that another delay must leave
-SURE = 10.0  # Standard deviations by which a coefficient is no zero
-WRONG = 3.0  # Ratio of what is driven and what is known from which on a unit is wrong
-SCALED = 1.2  # Ratio of the ways of angle and velocity from which on their scales contradict each other
+NONZERO = 10.0  # Least coefficient, in its standard deviations
+WRONG = 3.0  # Ratio of the torque found to that of the given k_m and J from which on a unit is wrong
+SCALED = 1.2  # Ratio of the travels by angle and by velocity from which on their scales contradict each other
 FACTOR = 10.0  # Values beyond a guess by this factor are not searched
 SPECIAL = tuple(
     sign * number / unit
@@ -69,15 +69,15 @@ Checks = Mapping[Callable[[Of], Found], str]
 
 def found_by(checks: Checks[Of], of: Of) -> Iterator[str]:
     """Each fault in words."""
-    for finds, says in checks.items():
-        if (found := finds(of)) is not None:
-            yield says.format(**found)
+    for check, sentence in checks.items():
+        if (found := check(of)) is not None:
+            yield sentence.format(**found)
 
 
 def require(checks: Checks[Series], s: Series, source: str) -> None:
     """Refuse the first fault of a signal; messages call the file ``source``."""
-    for said in found_by(checks, s):
-        raise UsageError(f"{source}: {said}")
+    for sentence in found_by(checks, s):
+        raise UsageError(f"{source}: {sentence}")
 
 
 # ---- times and values ----
@@ -172,12 +172,12 @@ def _is_alone(s: Series) -> Found:
         if s.noise and alone.sum() <= 0.5 * len(alone):
             low, high = s.values[~alone].min(), s.values[~alone].max()
             if min(abs(value - low), abs(value - high)) > APART * max(high - low, 10.0 * s.noise):
-                return _told(s, alone, low, high)
+                return _outliers(s, alone, low, high)
     return None
 
 
 def _is_special(s: Series) -> Found:
-    """Values beyond all others, or numbers known as special, or the same number now and then between others."""
+    """Values beyond all others, special numbers, or one number that comes again and again between others."""
     low, middle, high = np.percentile(s.values, (5.0, 50.0, 95.0))
     spreads = np.abs(s.values - middle) / max(high - low, 10.0 * s.noise, 1e-300)
     if not s.noise:  # a command may jump
@@ -186,32 +186,32 @@ def _is_special(s: Series) -> Found:
         far = spreads > FAR
         steps = np.abs(np.diff(s.values))
         after, counts = np.unique(s.values[1:][steps > FAR * np.percentile(steps, 80.0)], return_counts=True)
-        known = np.unique(s.values[np.isin(s.values, (0.0, *SPECIAL))])
-        for value in (*known, *after[counts > 1][:MOST_VALUES]):
+        special = np.unique(s.values[np.isin(s.values, (0.0, *SPECIAL))])
+        for value in (*special, *after[counts > 1][:MOST_VALUES]):
             far |= _between(s, s.values == value)
-    return _told(s, far, low, high) if 0 < far.sum() <= RARE * len(far) and high > low else None
+    return _outliers(s, far, low, high) if 0 < far.sum() <= RARE * len(far) and high > low else None
 
 
-def _told(s: Series, far: NDArray[np.bool_], low: float, high: float) -> Found:
+def _outliers(s: Series, far: NDArray[np.bool_], low: float, high: float) -> Found:
     """Values that are apart from the others, most of which are between low and high."""
     k, others, margin = int(np.argmax(far)), s.values[~far], 0.1 * (high - low)
     ends = {"low": others.min() - margin, "high": others.max() + margin}
     return s.at(k) | ends | {"count": far.sum(), "value": s.values[k]}
 
 
-def _between(s: Series, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Those of the chosen samples that lie apart from the ones before and after their short run, which agree."""
-    found, edges = np.zeros(len(chosen), np.bool_), np.flatnonzero(np.diff(np.pad(chosen, 1).astype(np.int8)))
+def _between(s: Series, special: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Short runs of special samples that lie apart from the sample before and the one after, where these two agree."""
+    found, edges = np.zeros(len(special), np.bool_), np.flatnonzero(np.diff(np.pad(special, 1).astype(np.int8)))
     usual = 10.0 * s.noise + 3.0 * float(np.percentile(np.abs(np.diff(s.values)), 80.0))
     for begin, end in edges.reshape(-1, 2).tolist():
-        if begin > 0 and end < len(chosen) and end - begin <= SHORT:
+        if begin > 0 and end < len(special) and end - begin <= SHORT:
             before, after, value = s.values[begin - 1], s.values[end], s.values[begin]
             away = min(abs(before - value), abs(after - value))
             found[begin:end] = away > 5.0 * max(usual * (end - begin + 1), abs(after - before))
     return found
 
 
-SPECIAL_SAID = (
+SPECIAL_SENTENCE = (
     "{count} values of {name} are apart from all others, the first one {value:.10g} in row {row}: where "
     "they say that there is no value, special = [{value:.10g}], or range = [{low:.4g}, {high:.4g}], of the signal "
     "leaves them out"
@@ -219,8 +219,8 @@ SPECIAL_SAID = (
 VALUES: Checks[Series] = {
     _is_huge: "{name} is {value:.4g} in row {row}, beyond any measurement: range = [LOW, HIGH] of the signal leaves "
     "such out",
-    _is_alone: SPECIAL_SAID,
-    _is_special: SPECIAL_SAID,
+    _is_alone: SPECIAL_SENTENCE,
+    _is_special: SPECIAL_SENTENCE,
 }
 
 
@@ -273,10 +273,10 @@ WRAPPED: Checks[Series] = {
 }
 ANGLES: Checks[Series] = {
     _is_huge: VALUES[_is_huge],
-    _is_alone: SPECIAL_SAID,
+    _is_alone: SPECIAL_SENTENCE,
     _wraps: "{name} jumps by {period:.10g} after row {row}, {count} times in all: it begins anew after a period; "
     "wrap = {period:.10g} of the signal continues it",
-    _is_special: SPECIAL_SAID,
+    _is_special: SPECIAL_SENTENCE,
     _is_set: "{name} jumps from {value:.6g} to {then:.6g} after row {row}, {count} times in all, as no motion does: "
     "was it set anew? [file] rows = [1, {row}] or [{next}, {last}] is one recording; range = [LOW, HIGH] of the signal "
     "leaves single values out",
@@ -290,46 +290,46 @@ ANGLES: Checks[Series] = {
 class Equation:
     """Second differences of the angle over spans of a recording, and of the double integrals of its torques."""
 
-    wanted: RecordingMap  # As the map says
+    recording_map: RecordingMap
     samples: Floats  # Angle and velocity on the grid, NaN where lost, shape (n + 1, 2)
     t_s: float  # Sample time [s]
-    left: Floats  # Second differences of the angle, shape (m,)
-    loads: Mapping[str, Floats]  # Those of friction, spring and a constant, by the parameter that they belong to
+    response: Floats  # Second differences of the angle, shape (m,)
+    loads: Mapping[str, Floats]  # Regressors of friction, spring and a constant, by their parameters, shape (m,) each
     drive: Floats  # Double integral of what acts, at each sample, shape (n + 1,)
     span: int  # [samples]
-    kept: NDArray[np.bool_]  # Spans without a lost sample
-    others: Floats  # Orthonormal basis of the loads, shape (m, loads)
+    complete: NDArray[np.bool_]  # Spans without a lost sample
+    basis: Floats  # Orthonormal basis of the loads, shape (m, loads)
     latest: int  # Largest delay that is looked for [samples]
 
     def driven(self, delay: float) -> Floats:
         """Double integral of what acts ``delay`` samples late, over each span."""
         at = np.arange(len(self.drive), dtype=np.float64)
-        return _second(np.interp(at - delay, at, self.drive), self.span)[self.kept]
+        return _second(np.interp(at - delay, at, self.drive), self.span)[self.complete]
 
     def correlation(self, delay: float) -> float:
         """Partial correlation of the angle with what acts, ``delay`` samples late, beside all loads."""
-        left, right = (row - self.others @ (self.others.T @ row) for row in (self.left, self.driven(delay)))
-        size = float(np.linalg.norm(left) * np.linalg.norm(right))
-        return float(left @ right) / size if size > 0.0 else 0.0
+        response, driven = (row - self.basis @ (self.basis.T @ row) for row in (self.response, self.driven(delay)))
+        size = float(np.linalg.norm(response) * np.linalg.norm(driven))
+        return float(response @ driven) / size if size > 0.0 else 0.0
 
     @cached_property
     def best(self) -> tuple[float, float]:
         """Delay of what acts with which the equation holds best [samples], and the correlation there."""
-        whole = max(range(-self.latest, self.latest + 1), key=self.correlation)
-        near = np.linspace(whole - 1.0, whole + 1.0, 21).tolist()
+        coarse = max(range(-self.latest, self.latest + 1), key=self.correlation)
+        near = np.linspace(coarse - 1.0, coarse + 1.0, 21).tolist()
         return max(((delay, self.correlation(delay)) for delay in near), key=lambda pair: pair[1])
 
 
-def equation_of(samples: Floats, currents: Floats, t_s: float, wanted: RecordingMap) -> Equation | None:
+def equation_of(samples: Floats, currents: Floats, t_s: float, recording_map: RecordingMap) -> Equation | None:
     """The equation of a recording; None where nothing moves by more than its noise, or too little of it is left."""
-    n, noise = min(len(currents), MOST), wanted.signals.angle.noise
+    n, noise = min(len(currents), MOST), recording_map.signals.angle.noise
     raw = samples[: n + 1, 0]
     there = np.isfinite(raw)
     angle = np.interp(np.arange(n + 1), np.flatnonzero(there), raw[there])
     for span in SPANS:
-        left = _second(angle, span)
-        kept = ~np.isnan(_second(raw, span))
-        if kept.sum() > 10 * span and math.sqrt(float(np.mean(left[kept] ** 2))) > TOLD * noise:
+        response = _second(angle, span)
+        complete = ~np.isnan(_second(raw, span))
+        if complete.sum() > 10 * span and math.sqrt(float(np.mean(response[complete] ** 2))) > SIGNIFICANT * noise:
             break
     else:
         return None
@@ -343,14 +343,14 @@ def equation_of(samples: Floats, currents: Floats, t_s: float, wanted: Recording
         "f_v": np.concatenate([[0.0], np.cumsum(-(middle - angle[0]) * t_s)]),
         "offset": _double(np.ones(n), t_s),
     }
-    if "k_1" in wanted.machine.parameters:
+    if "k_1" in recording_map.machine.parameters:
         loads["k_1"] = _double(-np.maximum(middle, 0.0), t_s)
     latest = max(min(LATEST, n // 10), 2)
-    kept[:latest] = kept[-latest:] = False  # what acts late there is not in the recording
-    second = {name: _second(load, span)[kept] for name, load in loads.items()}
+    complete[:latest] = complete[-latest:] = False  # a delayed torque there is not in the recording
+    second = {name: _second(load, span)[complete] for name, load in loads.items()}
     drive = _double(np.nan_to_num(currents[:n]), t_s)
-    others = np.linalg.qr(np.stack([*second.values()], axis=1))[0]
-    return Equation(wanted, samples, t_s, left[kept], second, drive, span, kept, others, latest)
+    basis = np.linalg.qr(np.stack([*second.values()], axis=1))[0]
+    return Equation(recording_map, samples, t_s, response[complete], second, drive, span, complete, basis, latest)
 
 
 def _second(row: Floats, span: int) -> Floats:
@@ -364,37 +364,37 @@ def _double(rate: Floats, t_s: float) -> Floats:
     return result
 
 
-def _ways(e: Equation) -> tuple[float, float]:
-    """Correlation of the ways of the angle with those that the velocity says, and their ratio; NaN without any."""
+def _travels(e: Equation) -> tuple[float, float]:
+    """Correlation of the travel over spans with the integrated velocity, and their ratio; NaN without a velocity."""
     angle, velocity = e.samples.T
-    if e.wanted.signals.velocity is None:  # it was derived
+    if e.recording_map.signals.velocity is None:  # it was derived
         return math.nan, math.nan
     steps = 0.5 * (velocity[1:] + velocity[:-1]) * e.t_s
-    said = np.lib.stride_tricks.sliding_window_view(steps, e.span).sum(axis=1)
-    seen = angle[e.span :] - angle[: -e.span]
-    said, seen = (row[np.isfinite(said) & np.isfinite(seen)] for row in (said, seen))
-    if not len(seen):
+    integrated = np.lib.stride_tricks.sliding_window_view(steps, e.span).sum(axis=1)
+    travelled = angle[e.span :] - angle[: -e.span]
+    integrated, travelled = (row[np.isfinite(integrated) & np.isfinite(travelled)] for row in (integrated, travelled))
+    if not len(travelled):
         return math.nan, math.nan
-    moved, size = float(seen @ seen), float(said @ said)
-    both = float(said @ seen)
+    moved, size = float(travelled @ travelled), float(integrated @ integrated)
+    both = float(integrated @ travelled)
     return (both / math.sqrt(moved * size), both / size) if moved * size > 0.0 else (0.0, 0.0)
 
 
 def _velocity_against(e: Equation) -> Found:
-    return {} if _ways(e)[0] < -0.9 else None
+    return {} if _travels(e)[0] < -0.9 else None
 
 
 def _velocity_differs(e: Equation) -> Found:
-    return {} if abs(_ways(e)[0]) < 0.5 else None
+    return {} if abs(_travels(e)[0]) < 0.5 else None
 
 
 def _velocity_scaled(e: Equation) -> Found:
-    correlation, ratio = _ways(e)
+    correlation, ratio = _travels(e)
     return {"ratio": ratio} if correlation > 0.95 and not 1.0 / SCALED < ratio < SCALED else None
 
 
 def _driven_against(e: Equation) -> Found:
-    return {"by": e.wanted.signals.acting} if e.correlation(0.0) < -0.5 and e.best[1] < 0.8 else None
+    return {"by": e.recording_map.signals.acting} if e.correlation(0.0) < -0.5 and e.best[1] < 0.8 else None
 
 
 def _is_late(e: Equation) -> Found:
@@ -402,42 +402,43 @@ def _is_late(e: Equation) -> Found:
     rest, now = 1.0 - correlation**2, 1.0 - max(e.correlation(0.0), 0.0) ** 2
     if EARLY < best < LATE or abs(best) > e.latest or correlation < 0.8 or rest > BETTER * now:
         return None
-    by, how = e.wanted.signals.acting, "late" if best > 0.0 else "early"
+    by, how = e.recording_map.signals.acting, "late" if best > 0.0 else "early"
     return {
         "by": by,
         "samples": abs(best),
         "how": how,
-        "delay": e.wanted.signals.given[by].delay + best * e.t_s,
+        "delay": e.recording_map.signals.given[by].delay + best * e.t_s,
     }
 
 
-def _told_shares(e: Equation) -> tuple[dict[str, float], dict[str, float]]:
-    """Coefficients of the equation at the best delay that are no zero, all over J; and what is known of them."""
+def _coefficients(e: Equation) -> tuple[dict[str, float], dict[str, float]]:
+    """Significant coefficients of the equation at the best delay, divided by J; and the parameters in the map."""
     names, columns = ["k_m", *e.loads], np.stack([e.driven(e.best[0]), *e.loads.values()], axis=1)
-    found = np.linalg.lstsq(columns, e.left, rcond=None)[0]
-    spread = float(np.mean((e.left - columns @ found) ** 2))
-    sure = SURE * np.sqrt(np.abs(np.diag(np.linalg.pinv(columns.T @ columns))) * spread)
-    told = {name: c for name, c, least in zip(names, found.tolist(), sure.tolist(), strict=True) if c > least}
-    return told, ({} if "k_m" in e.wanted.machine.guess.given else {"k_m": 1.0}) | e.wanted.machine.known.given
+    found = np.linalg.lstsq(columns, e.response, rcond=None)[0]
+    spread = float(np.mean((e.response - columns @ found) ** 2))
+    sure = NONZERO * np.sqrt(np.abs(np.diag(np.linalg.pinv(columns.T @ columns))) * spread)
+    significant = {name: c for name, c, least in zip(names, found.tolist(), sure.tolist(), strict=True) if c > least}
+    machine = e.recording_map.machine
+    return significant, ({} if "k_m" in machine.guess.given else {"k_m": 1.0}) | machine.known.given
 
 
 def _driven_scaled(e: Equation) -> Found:
-    told, known = _told_shares(e)
-    if not {"J", "k_m"} <= {*known} or "k_m" not in told:
+    significant, known = _coefficients(e)
+    if not {"J", "k_m"} <= {*known} or "k_m" not in significant:
         return None
-    ratio = told["k_m"] * known["J"] / known["k_m"]
-    return {"by": e.wanted.signals.acting, "ratio": ratio} if not 1.0 / WRONG < ratio < WRONG else None
+    ratio = significant["k_m"] * known["J"] / known["k_m"]
+    return {"by": e.recording_map.signals.acting, "ratio": ratio} if not 1.0 / WRONG < ratio < WRONG else None
 
 
 def _is_far(e: Equation) -> Found:
     """Guesses that are beyond the search."""
-    told, known = _told_shares(e)
-    inertia = known.get("J") or next((known[name] / c for name, c in told.items() if name in known), math.nan)
+    significant, known = _coefficients(e)
+    inertia = known.get("J") or next((known[name] / c for name, c in significant.items() if name in known), math.nan)
     gears = {"k_1": known.get("gamma", 1.0)}
-    values = {"J": inertia} | {name: share * inertia / gears.get(name, 1.0) for name, share in told.items()}
+    values = {"J": inertia} | {name: share * inertia / gears.get(name, 1.0) for name, share in significant.items()}
     wrong = {
         name: values[name]
-        for name, guess in e.wanted.machine.guess.given.items()
+        for name, guess in e.recording_map.machine.guess.given.items()
         if name in values and abs(math.log(values[name] / guess)) > math.log(FACTOR)
     }
     shown = ", ".join(f"{name} = {value:.2g}" for name, value in wrong.items())
@@ -459,10 +460,10 @@ EQUATIONS: Checks[Equation] = {
 }
 
 
-def contradictions(samples: Floats, currents: Floats, t_s: float, wanted: RecordingMap) -> tuple[str, ...]:
+def contradictions(samples: Floats, currents: Floats, t_s: float, recording_map: RecordingMap) -> tuple[str, ...]:
     """Contradictions of a map by its recording, the cause of others first.
 
     Samples on the grid and what acted in each period, as the map says; shapes (n + 1, 2) and (n,), sample time in s.
     """
-    equation = equation_of(samples, currents, t_s, wanted)
+    equation = equation_of(samples, currents, t_s, recording_map)
     return () if equation is None else tuple(found_by(EQUATIONS, equation))

@@ -1,4 +1,4 @@
-"""The map file: which column of a foreign file is what, in which unit, and what is known of the machine."""
+"""The map file: the column and unit of each signal in a foreign file, and the parameters of the machine."""
 
 from __future__ import annotations
 
@@ -71,18 +71,18 @@ class Signals(msgspec.Struct, frozen=True, kw_only=True):
     current: Signal | None = None
 
     def __post_init__(self) -> None:
-        """Check units and noise, and that what acted is known."""
+        """Check units and noise, and that a command or a current is there."""
         linear = self.angle.unit == ALONG["angle"]
         units = ALONG if linear else AROUND
-        known = {
+        allowed = {
             "angle": (AROUND["angle"], ALONG["angle"]),
             "velocity": (units["velocity"],),
             "command": tuple(unit for unit in COMMANDS if unit not in LOADS or unit == units["command"]),
             "current": ("A",),
         }
         for name, signal in self.given.items():
-            if signal.unit not in known[name]:
-                expected = f"expected one of {', '.join(known[name])}, and scale as the factor to it"
+            if signal.unit not in allowed[name]:
+                expected = f"expected one of {', '.join(allowed[name])}, and scale as the factor to it"
                 raise FieldError(f"{name}.unit", f"{expected}; got {typed.shown(signal.unit)}")
             if not signal.range[0] < signal.range[1]:
                 raise FieldError(f"{name}.range", "expected the lower value first")
@@ -171,7 +171,7 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Machine(msgspec.Struct, frozen=True, kw_only=True):
-    """Known facts about the machine."""
+    """Parameters of the machine: given ones, and guesses of those to estimate."""
 
     guess: Parameters
     known: Parameters = Parameters()

@@ -51,7 +51,7 @@ def read_columns(
 ) -> dict[Place, Column]:
     """Columns of a file of a kind; ``struct.field`` and ``matrix(:,1)`` inside MATLAB structures.
 
-    Enters in ``lacks`` what was left out on the way. The DBC of CAN frames lies in the ``folder``.
+    Enters in ``lacks`` what was passed over. The DBC of CAN frames lies in the ``folder``.
     """
     readers: Mapping[str, tuple[str, Callable[[], Iterator[Read]]]] = {
         "csv": ("CSV", lambda: _csv(path, source, places, lacks)),
@@ -88,12 +88,12 @@ def _errors_in_one_line(path: Path, kind: str) -> Iterator[None]:
         raise
     except Exception as err:  # every library has errors of its own, and some raise whatever they meet
         _let_go(err)
-        said = " ".join(str(err).split())[:120] or type(err).__name__
-        raise UsageError(f"{path}: not readable as {kind}: {said}") from err
+        message = " ".join(str(err).split())[:120] or type(err).__name__
+        raise UsageError(f"{path}: not readable as {kind}: {message}") from err
 
 
 def _let_go(err: Exception) -> None:
-    """Ends what a library has half made, and with it what that complains about once it is collected."""
+    """Collects the unfinished objects of a library, and discards the complaints of their finalizers."""
     hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
     one: BaseException | None = err
     try:
@@ -105,9 +105,9 @@ def _let_go(err: Exception) -> None:
         sys.unraisablehook = hook
 
 
-def _require_one(path: Path, name: str, places: Sequence[Any], known: Sequence[str], more: str = "") -> None:
+def _require_one(path: Path, name: str, places: Sequence[Any], columns: Sequence[str], more: str = "") -> None:
     if not places:
-        others = ", ".join(known[:NAMED]) + (", ..." if len(known) > NAMED else "")
+        others = ", ".join(columns[:NAMED]) + (", ..." if len(columns) > NAMED else "")
         raise UsageError(f"{path}: no column is called {name!r}; it has: {others or 'none'}{more}")
     if len(places) > 1:
         raise UsageError(f"{path}: {len(places)} columns are called {name!r}: expected one{more}")
@@ -154,8 +154,8 @@ def _csv(path: Path, source: Source, places: Sequence[Place], lacks: Entered) ->
     before, (_, last) = line + source.skip, source.rows or (1, MOST)
     unfit = list[str]()
 
-    def judged(row: Any) -> str:
-        """A last row that is cut is left out, and so are those after the last that is wanted."""
+    def handle_row(row: Any) -> str:
+        """Skips a last row that is cut, and the rows after the last one of the map; refuses any other."""
         if text.endswith(f"\n{row.text}") or row.number - before > last:
             return "skip"
         unfit.append(f"line {row.number}: expected {row.expected_columns} columns, got {row.actual_columns}")
@@ -166,7 +166,7 @@ def _csv(path: Path, source: Source, places: Sequence[Place], lacks: Entered) ->
         table = read_csv(
             pa.BufferReader(text.encode()),
             ReadOptions(skip_rows=before, column_names=titles, use_threads=False),
-            ParseOptions(delimiter=delimiter, invalid_row_handler=judged),
+            ParseOptions(delimiter=delimiter, invalid_row_handler=handle_row),
             ConvertOptions(
                 decimal_point=source.decimal, null_values=[*MISSING, *source.missing], strings_can_be_null=True
             ),
@@ -195,28 +195,28 @@ def _is_number(text: str) -> bool:
 def _head(path: Path, text: str, source: Source, places: Sequence[Place]) -> tuple[int, list[str]]:
     """Line of the head, the first being 1, and the name of each column; 0 and numbers where there is none."""
     lines = re.split(r"\r\n|\n|\r", text[: 1 << 20])[: max(HEADS, source.head or 0)]
-    delimiter, wanted = DELIMITERS[source.delimiter], {place.column for place in places}
+    delimiter, required = DELIMITERS[source.delimiter], {place.column for place in places}
     if (source.head or 0) > len(lines):
         raise UsageError(f"{path}: [file] head = {source.head}: expected one of its {len(lines)} lines")
     if source.head == 0:
         at, titles = -1, [str(n + 1) for n, _ in enumerate(_split(lines[0], delimiter))]
     else:
         among = range(len(lines)) if source.head is None else range(source.head - 1, min(source.head, len(lines)))
-        at = max(among, key=lambda i: len(wanted & {*_split(lines[i], delimiter)}), default=0)
+        at = max(among, key=lambda i: len(required & {*_split(lines[i], delimiter)}), default=0)
         titles = _split(lines[at], delimiter)
-    if lost := [place.column for place in places if place.column not in titles]:
-        _require_one(path, lost[0], (), titles, _remedy(lines, at, titles, source, wanted))
+    if missing := [place.column for place in places if place.column not in titles]:
+        _require_one(path, missing[0], (), titles, _remedy(lines, at, titles, source, required))
     first = next((line for line in lines[at + 1 + source.skip :] if line.strip()), "")
     width = len(_split(first, delimiter))  # some put a delimiter at the end of a head or of each row
     return at + 1, (titles + [""] * (width - len(titles)))[: None if any(titles[width:]) else width]
 
 
-def _remedy(lines: Sequence[str], at: int, titles: Sequence[str], source: Source, wanted: set[str]) -> str:
+def _remedy(lines: Sequence[str], at: int, titles: Sequence[str], source: Source, required: set[str]) -> str:
     """Key of the map that may find the columns of a CSV file; else the line that was taken for its head."""
     if at >= 0 and titles and all(map(_is_number, titles)):
         return f". No head: its first line is numbers; with [file] head = 0 columns are 1 to {len(titles)}"
     for name, other in DELIMITERS.items():
-        fits = [i for i, line in enumerate(lines) if wanted <= {*_split(line, other)}]
+        fits = [i for i, line in enumerate(lines) if required <= {*_split(line, other)}]
         if fits and name != source.delimiter:
             return f'. With [file] delimiter = "{name}" line {fits[0] + 1} has them'
     if at > 0:
@@ -230,22 +230,22 @@ def _parquet(path: Path, source: Source, places: Sequence[Place]) -> Iterator[Re
 
     names = {place.column for place in places}
     with parquet.ParquetFile(path) as file:
-        known = file.schema_arrow.names
-        return _arrow(path, file.read(columns=[name for name in known if name.strip() in names]), source, places, known)
+        every = file.schema_arrow.names
+        return _arrow(path, file.read(columns=[name for name in every if name.strip() in names]), source, places, every)
 
 
 def _arrow(
-    path: Path, table: Any, source: Source, places: Sequence[Place], known: Sequence[str] | None = None
+    path: Path, table: Any, source: Source, places: Sequence[Place], names: Sequence[str] | None = None
 ) -> Iterator[Read]:
     for place in places:
         name = place.column
-        at = [i for i, own in enumerate(table.column_names) if own.strip() == name]
-        _require_one(path, name, at, known or table.column_names)
+        at = [i for i, title in enumerate(table.column_names) if title.strip() == name]
+        _require_one(path, name, at, names or table.column_names)
         column, kind = table.column(at[0]), str(table.column(at[0]).type)
         if kind.startswith(("time", "duration")):  # or a timestamp
             fine = re.sub(r"^time(?:32|64)", "time64", re.sub(r"\[.*", "[ns]", kind))
-            whole = column.cast(fine).cast("int64").to_numpy()
-            yield place, (whole - whole[np.isfinite(whole)][:1].sum()) * 1e-9, None
+            counts = column.cast(fine).cast("int64").to_numpy()
+            yield place, (counts - counts[np.isfinite(counts)][:1].sum()) * 1e-9, None
         elif kind in ("string", "large_string"):
             yield place, _of_texts(path, name, column.to_pylist(), source), None
         else:
@@ -290,14 +290,14 @@ def _matlab(path: Path, places: Sequence[Place]) -> Iterator[Read]:
         if file.read(10) == b"MATLAB 7.3":
             raise UsageError(f"{path}: a file of MATLAB 7.3: save it with -v7")
     content = io.loadmat(path, squeeze_me=True, struct_as_record=False, simplify_cells=True)
-    known = [text for key, value in content.items() if not key.startswith("__") for text in _inside(key, value)]
+    columns = [text for key, value in content.items() if not key.startswith("__") for text in _inside(key, value)]
     for place in places:
         value: Any = content
         for part in place.column.split("."):
             indexed = _INDEX.fullmatch(part)
             name = part if indexed is None else indexed[1]
             found = [value[name]] if isinstance(value, Mapping) and name in value else []
-            _require_one(path, place.column, found, known)
+            _require_one(path, place.column, found, columns)
             value = found[0]
             if indexed is not None:
                 value = _part(path, indexed, value)
@@ -331,13 +331,13 @@ def _mdf(path: Path, places: Sequence[Place]) -> Iterator[Read]:
     from asammdf import MDF
 
     with MDF(path) as file:
-        known = sorted(name for name in file.channels_db if name not in ("time", "t"))
+        columns = sorted(name for name in file.channels_db if name not in ("time", "t"))
         for place in places:
             every = file.channels_db.get(place.column, ())
             found = [at for at in every if place.group in (None, at[0])]
             groups = [f"{number} ({file.groups[number].channel_group.cycles_nr} values)" for number, _ in every]
             more = f"; it is in the groups {', '.join(groups)}: group = N of the signal names one" if groups else ""
-            _require_one(path, place.column, found, known, more)
+            _require_one(path, place.column, found, columns, more)
             signal = file.get(group=found[0][0], index=found[0][1])
             yield place, signal.samples, signal.timestamps
 
@@ -360,13 +360,13 @@ def _can(path: Path, source: Source, places: Sequence[Place], lacks: Entered, fo
                 elsewhere[str(frame.channel)] += 1
                 continue
             key = frame.is_extended_id, frame.arbitration_id
-            shown = _identifier(*key)
+            identifier = _identifier(*key)
             if key not in of or frame.is_error_frame or frame.is_remote_frame:
-                others["error frames" if frame.is_error_frame else shown] += 1
+                others["error frames" if frame.is_error_frame else identifier] += 1
                 continue
             if (first := channels.setdefault(key, frame.channel)) != frame.channel:
                 where = f"channels {first} and {frame.channel}"
-                raise UsageError(f"{path}: {shown} comes on {where}: [file] channel names one")
+                raise UsageError(f"{path}: {identifier} comes on {where}: [file] channel names one")
             for message in of[key].values():
                 values = _decoded(message, frame.data)
                 if values is None:
@@ -377,22 +377,22 @@ def _can(path: Path, source: Source, places: Sequence[Place], lacks: Entered, fo
     lacks.update({lack: numbers for lack, numbers in passed.items() if numbers[0]})
     for place, (message, name) in signals.items():
         if not (found := rows.get((message.name, name), [])):
-            wanted = _identifier(message.is_extended_frame, message.frame_id)
+            identifier = _identifier(message.is_extended_frame, message.frame_id)
             why = _passed(
                 {"do not fit the DBC": unread, "have other numbers": others, "have other channels": elsewhere}
             )
-            raise UsageError(f"{path}: {place.column}: no frame {wanted} has it: {why}")
+            raise UsageError(f"{path}: {place.column}: no frame {identifier} has it: {why}")
         yield place, [value for _, value in found], [time for time, _ in found]
 
 
 def _passed(counted: Mapping[str, Counter[str]]) -> str:
     """Says which frames were passed over, by the reason."""
-    told = [
+    parts = [
         f"{counts.total()} {reason}, {', '.join(f'{key} ({n})' for key, n in counts.most_common(NAMED))}"
         for reason, counts in counted.items()
         if counts
     ]
-    return "; ".join(told) or "the file has none"
+    return "; ".join(parts) or "the file has none"
 
 
 def _identifier(extended: bool, number: int) -> str:
@@ -420,10 +420,10 @@ def _signals(dbc: Path, places: Sequence[Place]) -> dict[Place, tuple[Any, str]]
     made, result = dict[str, Any](), dict[Place, tuple[Any, str]]()
     for place in places:
         of, _, signal = place.column.rpartition(".")
-        known = [f"{message}.{name}" for message, name in names]
+        columns = [f"{message}.{name}" for message, name in names]
         found = [(message, name) for message, name in names if name == signal and of in ("", message)]
         several = f": {', '.join('.'.join(pair) for pair in found)}" if found else faults
-        _require_one(dbc, place.column, found, known, several)
+        _require_one(dbc, place.column, found, columns, several)
         try:
             made[found[0][0]] = made.get(found[0][0]) or parse(messages[found[0][0]].text).messages[0]
         except FrameError as err:

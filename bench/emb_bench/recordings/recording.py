@@ -28,11 +28,11 @@ def open_recording(path: Path, map_path: Path) -> Recording:
     Raises:
         UsageError: a file cannot be read, the map does not fit the recording, or a library is missing.
     """
-    wanted, map_text = read_map(map_path)
-    kind, lacks = wanted.kind_of(path), dict[Lack, tuple[float, ...]]()
-    columns = read_columns(path, kind, wanted.file, wanted.places, lacks, map_path.parent)
-    found = experiment_of(columns, wanted, kind, str(path), lacks)
-    text = bench_of(found, wanted)
+    recording_map, map_text = read_map(map_path)
+    kind, lacks = recording_map.kind_of(path), dict[Lack, tuple[float, ...]]()
+    columns = read_columns(path, kind, recording_map.file, recording_map.places, lacks, map_path.parent)
+    found = experiment_of(columns, recording_map, kind, str(path), lacks)
+    text = bench_of(found, recording_map)
     try:
         parse_bench(text, f"{map_path}: the bench file made of it", analysis=True)
     except UsageError:
@@ -43,7 +43,7 @@ def open_recording(path: Path, map_path: Path) -> Recording:
         path=path,
         complete=True,
         missing="",
-        metadata={"emb.run": {"bench_name": wanted.name}},
+        metadata={"emb.run": {"bench_name": recording_map.name}},
         attachments={"bench.toml": text.encode(), "map.toml": map_text.encode()},
         size=path.stat().st_size,
         span=(0, 0),
@@ -53,9 +53,9 @@ def open_recording(path: Path, map_path: Path) -> Recording:
     )
 
 
-def bench_of(found: Found, wanted: RecordingMap) -> str:
+def bench_of(found: Found, recording_map: RecordingMap) -> str:
     """Text of the bench file of a machine for analysis, from its map and its samples."""
-    machine = wanted.machine
+    machine = recording_map.machine
     samples = found.experiment.all_samples
     low, high = float(np.nanmin(samples[:, 0])), float(np.nanmax(samples[:, 0]))
     speed, current = float(np.nanmax(np.abs(samples[:, 1]))), float(np.abs(found.experiment.currents).max())
@@ -65,13 +65,13 @@ def bench_of(found: Found, wanted: RecordingMap) -> str:
     plant = {name: 0.0 for name in machine.unknown if name not in brake} | {"tolerance": tolerance}
     document = {
         "schema": 1,
-        "name": wanted.name,
+        "name": recording_map.name,
         "machine": {
             "unknown": [*machine.unknown],
             "nuisances": [*machine.nuisances],
             "window": machine.window,
-            "angle": wanted.signals.angle.unit,
-            "command": wanted.command_unit,
+            "angle": recording_map.signals.angle.unit,
+            "command": recording_map.command_unit,
         },
         "brake": brake,
         "limits": {

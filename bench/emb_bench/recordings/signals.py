@@ -35,7 +35,7 @@ class Found(NamedTuple):
 
 def experiment_of(
     columns: Mapping[Place, Column],
-    wanted: RecordingMap,
+    recording_map: RecordingMap,
     kind: str,
     source: str,
     lacks: Mapping[Lack, tuple[float, ...]] = MappingProxyType({}),
@@ -45,16 +45,16 @@ def experiment_of(
     Raises:
         UsageError: the columns have faults, see :mod:`emb_bench.recordings.faults`, or are too short.
     """
-    given, timing, name = wanted.signals.given, wanted.timing, Path(source).name
+    given, timing, name = recording_map.signals.given, recording_map.timing, Path(source).name
     source += f" (head in line {lacks[Lack.HEAD][0]})" if Lack.HEAD in lacks else ""
-    read = _read(columns, wanted, source)
+    read = _read(columns, recording_map, source)
     signals = {
         name: (series.times + given[name].delay, _in_si(series.values, given[name])) for name, series in read.items()
     }
     times, angles = signals["angle"]
     t_s = timing.sample_time or _sample_time(times)
     if not 1e-4 <= t_s <= 0.1:
-        units = [unit for unit, seconds in TIME.items() if 1e-4 <= t_s / wanted.time_unit * seconds <= 0.1]
+        units = [unit for unit, seconds in TIME.items() if 1e-4 <= t_s / recording_map.time_unit * seconds <= 0.1]
         hint = f"; with unit = {' or '.join(map(repr, units))} it is" if timing.column and units else ""
         raise UsageError(
             f"{source}: expected a sample time from 0.0001 to 0.1 s, got {t_s:g} s: see [timing] in the map{hint}"
@@ -78,15 +78,15 @@ def experiment_of(
     else:
         velocity = _nearest(*signals["velocity"], grid, t_s)
         velocity_noise = given["velocity"].noise
-    applied = _applied(signals, grid, t_s, held="command" not in given or given["command"].between != "linear")
+    applied = _applied(signals, grid, t_s, hold="command" not in given or given["command"].between != "linear")
     received = np.isfinite(angle) & np.isfinite(velocity) & np.isfinite(applied)
     if int(received.sum()) < FEWEST:
         raise UsageError(
             f"{source}: velocity and current cover {int(received.sum())} samples, expected at least {FEWEST}"
         )
-    whole = slice(int(np.argmax(received)), int(np.flatnonzero(received)[-1]) + 1)
-    samples = np.where(received[:, None], np.stack([angle, velocity], axis=1), np.nan)[whole]
-    received, late, currents = received[whole], late[whole] - late[whole.start], applied[whole][1:]
+    span = slice(int(np.argmax(received)), int(np.flatnonzero(received)[-1]) + 1)
+    samples = np.where(received[:, None], np.stack([angle, velocity], axis=1), np.nan)[span]
+    received, late, currents = received[span], late[span] - late[span.start], applied[span][1:]
     start = float(samples[0, 0]), float(samples[0, 1])
     experiment = Experiment(
         name=name,
@@ -94,48 +94,48 @@ def experiment_of(
         samples=samples[1:],
         angle=start[0],
         velocity=start[1],
-        slack=0.0,  # nothing is known before the first sample
+        slack=0.0,  # the log has no time before the first sample
         from_origin=start == (0.0, 0.0),
         late=late[1:],
         assumed=None if received.all() else np.where(received[1:], np.nan, currents),
         first=start,
         quality=Quality(
             planned=len(currents),
-            lacks=_lacks(wanted, kind, bandwidth, int((~received).sum())) | {**lacks},
-            faults=contradictions(samples, currents, t_s, wanted),
+            lacks=_lacks(recording_map, kind, bandwidth, int((~received).sum())) | {**lacks},
+            faults=contradictions(samples, currents, t_s, recording_map),
         ),
     )
     return Found(experiment, t_s, (angle_noise, velocity_noise), bandwidth)
 
 
-def _read(columns: Mapping[Place, Column], wanted: RecordingMap, source: str) -> dict[str, Series]:
+def _read(columns: Mapping[Place, Column], recording_map: RecordingMap, source: str) -> dict[str, Series]:
     """The signals without faults, angles continued over their period; rows that repeat the one before are left out."""
-    given, clock = wanted.signals.given, _clock(columns, wanted)
-    first = wanted.file.rows[0] if wanted.file.rows else 1
+    given, clock = recording_map.signals.given, _clock(columns, recording_map)
+    first = recording_map.file.rows[0] if recording_map.file.rows else 1
     repeated: NDArray[np.bool_] = np.zeros(1, np.bool_)
     if clock is not None and len({len(column.values) for column in columns.values()}) == 1:
         table = np.stack([column.values for column in columns.values()])
         repeated = np.append([False], (table[:, 1:] == table[:, :-1]).all(axis=0))
     found = dict[str, Series]()
     for name, signal in given.items():
-        values, own = columns[signal.place]
+        values, column_times = columns[signal.place]
         rows = np.arange(len(values))
-        time: Floats = np.asarray(rows * wanted.timing.sample_time if clock is None else clock, np.float64)
-        time = time if own is None else own
+        time: Floats = np.asarray(rows * recording_map.timing.sample_time if clock is None else clock, np.float64)
+        time = time if column_times is None else column_times
         if len(time) != len(values):
             raise UsageError(f"{source}: {signal.column}: {len(values)} values and {len(time)} times: expected as many")
         low, high = signal.range
-        kept = np.isfinite(values) & np.isfinite(time) & (low <= values) & (values <= high) & ~repeated
-        kept &= ~np.isin(values, signal.special) & (np.abs(time) < HUGE)
-        if kept.sum() < FEWEST:
-            raise UsageError(f"{source}: {signal.column}: {kept.sum()} values are numbers, expected at least {FEWEST}")
+        valid = np.isfinite(values) & np.isfinite(time) & (low <= values) & (values <= high) & ~repeated
+        valid &= ~np.isin(values, signal.special) & (np.abs(time) < HUGE)
+        if valid.sum() < FEWEST:
+            raise UsageError(f"{source}: {signal.column}: {valid.sum()} values are numbers, expected at least {FEWEST}")
         found[name] = series = Series(
             name=f"{signal.column} ([signals.{name}])",
-            rows=rows[kept] + first,
-            times=time[kept],
-            values=values[kept],
-            tick=wanted.time_unit,
-            sample_time=wanted.timing.sample_time if name == "angle" else 0.0,
+            rows=rows[valid] + first,
+            times=time[valid],
+            values=values[valid],
+            tick=recording_map.time_unit,
+            sample_time=recording_map.timing.sample_time if name == "angle" else 0.0,
             noise=signal.noise / signal.scale,
             wrap=signal.wrap,
         )
@@ -155,9 +155,9 @@ def _read(columns: Mapping[Place, Column], wanted: RecordingMap, source: str) ->
     return found | {"angle": angle}
 
 
-def _clock(columns: Mapping[Place, Column], wanted: RecordingMap) -> Floats | None:
+def _clock(columns: Mapping[Place, Column], recording_map: RecordingMap) -> Floats | None:
     """Time of each row [s]; None where the format, or a sample time, says it."""
-    timing = wanted.timing
+    timing = recording_map.timing
     if not timing.column:
         return None
     counts = columns[Place(timing.column)].values
@@ -166,7 +166,7 @@ def _clock(columns: Mapping[Place, Column], wanted: RecordingMap) -> Floats | No
         turns = np.cumsum(np.diff(counts[there], prepend=counts[there][:1]) < -0.5 * timing.wrap)
         counts = counts.copy()
         counts[there] += timing.wrap * turns
-    seconds = counts * wanted.time_unit
+    seconds = counts * recording_map.time_unit
     if timing.fraction:
         seconds = seconds + columns[Place(timing.fraction)].values * TIME[timing.fraction_unit]
     return seconds
@@ -204,36 +204,36 @@ def _on_grid(times: Floats, t_s: float) -> tuple[Integers, Integers]:
     return step[order][first], order[first].astype(np.int64)
 
 
-def _nearest(times: Floats, values: Floats, wanted: Floats, t_s: float) -> Floats:
+def _nearest(times: Floats, values: Floats, grid: Floats, t_s: float) -> Floats:
     """The value nearest in time, NaN where there is none within half a period."""
-    right = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
-    index = np.where(wanted - times[right - 1] <= times[right] - wanted, right - 1, right)
-    result: Floats = np.where(np.abs(times[index] - wanted) <= 0.5 * t_s, values[index], np.nan)
+    right = np.clip(np.searchsorted(times, grid), 1, len(times) - 1)
+    index = np.where(grid - times[right - 1] <= times[right] - grid, right - 1, right)
+    result: Floats = np.where(np.abs(times[index] - grid) <= 0.5 * t_s, values[index], np.nan)
     return result
 
 
-def _applied(signals: Mapping[str, tuple[Floats, Floats]], at: Floats, t_s: float, held: bool) -> Floats:
+def _applied(signals: Mapping[str, tuple[Floats, Floats]], at: Floats, t_s: float, hold: bool) -> Floats:
     """Current of the period before each time [A]; NaN where the current that was measured does not cover it."""
     if "current" not in signals:
-        return _means(*signals["command"], at - t_s, at, held)
+        return _means(*signals["command"], at - t_s, at, hold)
     times, values = signals["current"]
     covered = (at - t_s >= times[0] - 0.5 * t_s) & (at <= times[-1] + 0.5 * t_s)
-    return np.where(covered, _means(times, values, at - t_s, at, held=False), np.nan)
+    return np.where(covered, _means(times, values, at - t_s, at, hold=False), np.nan)
 
 
-def _means(times: Floats, values: Floats, begin: Floats, end: Floats, held: bool) -> Floats:
-    """Mean from each begin to its end of what is held from each time on, or else goes straight from one to the next.
+def _means(times: Floats, values: Floats, begin: Floats, end: Floats, hold: bool) -> Floats:
+    """Mean of a signal between each begin and its end: with zero-order hold (``hold``), or else linear between samples.
 
     Before the first time and after the last it is as at these.
     """
     times, values = np.concatenate([times, times[-1:] + (end[-1] - begin[-1])]), np.concatenate([values, values[-1:]])
-    heights = values[:-1] if held else 0.5 * (values[:-1] + values[1:])
-    slopes = np.zeros(len(values)) if held else np.append(np.diff(values) / np.maximum(np.diff(times), 1e-12), 0.0)
+    heights = values[:-1] if hold else 0.5 * (values[:-1] + values[1:])
+    slopes = np.zeros(len(values)) if hold else np.append(np.diff(values) / np.maximum(np.diff(times), 1e-12), 0.0)
     areas = np.concatenate([[0.0], np.cumsum(heights * np.diff(times))])
 
-    def area(wanted: Floats) -> Floats:
-        at = np.clip(np.searchsorted(times, wanted, side="right") - 1, 0, len(times) - 1)
-        since = wanted - times[at]
+    def area(time: Floats) -> Floats:
+        at = np.clip(np.searchsorted(times, time, side="right") - 1, 0, len(times) - 1)
+        since = time - times[at]
         result: Floats = areas[at] + since * (values[at] + 0.5 * since * np.where(since > 0.0, slopes[at], 0.0))
         return result
 
@@ -251,15 +251,15 @@ def _derived(step: Integers, angle: Floats, t_s: float, bandwidth: float) -> Flo
     return np.array(found)
 
 
-def _lacks(wanted: RecordingMap, kind: str, bandwidth: float, lost: int) -> dict[Lack, tuple[float, ...]]:
+def _lacks(recording_map: RecordingMap, kind: str, bandwidth: float, lost: int) -> dict[Lack, tuple[float, ...]]:
     found: dict[Lack, tuple[float, ...]] = {Lack.NO_COUNTERS: ()}
     if bandwidth:
         found[Lack.NO_VELOCITY] = (bandwidth,)
-    if wanted.signals.current is None:
+    if recording_map.signals.current is None:
         found[Lack.NO_CURRENT] = ()
-    if wanted.signals.command is None:
+    if recording_map.signals.command is None:
         found[Lack.NO_COMMANDS] = ()
-    if not wanted.timing.column and kind not in TIMED:
+    if not recording_map.timing.column and kind not in TIMED:
         found[Lack.NO_TIMES] = ()
     if lost:
         found[Lack.LOST_OF_RECORDING] = (lost,)
