@@ -1,6 +1,6 @@
-"""A campaign: many logs, each evaluated on its own, a file of rows, and a summary.
+"""A campaign: many logs, each evaluated by itself, a file of rows, and a summary.
 
-Logs are shared out to processes or to Ray: one that dies, or takes too long, costs its own log and no other.
+Logs are distributed to processes or to Ray: a process that dies, or takes too long, costs its log only.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def run_campaign(paths: Sequence[Path], output: Path, options: CampaignOptions) 
 
 
 def in_order(sources: Sequence[Source], numbered: Generator[tuple[int, Row | Lost], None, None]) -> list[Row]:
-    """All rows in the order of the logs; shows how many there are, and says at once what failed."""
+    """All rows in the order of the logs; shows the progress, and names each failure at once."""
     rows = dict[int, Row]()
     with closing(numbered), progress("logs", len(sources)) as advance:  # processes end with the generator
         for number, found in numbered:

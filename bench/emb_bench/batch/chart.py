@@ -35,10 +35,10 @@ def draw_chart(rows: Sequence[Row], c: Campaign, path: Path) -> bool:
         for name, line in zip(used, axes, strict=True):
             of = columns_of(used[name], name)
             for key, axis in zip(shown, line, strict=True):
-                (known, at), found = condition_of(used[name], key, begun), over[name].get(key)
+                (places, at), found = condition_of(used[name], key, begun), over[name].get(key)
                 unit_size = shown_as(key, c.span)[2]
                 slope = found.slope * unit_size if found is not None and found.significant else None
-                _draw(axis, name, np.array(at) / unit_size, of["estimate"], of["between_runs"], known, slope)
+                _draw(axis, name, np.array(at) / unit_size, of["estimate"], of["between_runs"], places, slope)
         for key, axis in zip(shown, axes[-1], strict=True):
             label, unit, _ = shown_as(key, c.span)
             axis.locator_params(axis="x", nbins=5)
@@ -47,21 +47,21 @@ def draw_chart(rows: Sequence[Row], c: Campaign, path: Path) -> bool:
 
 
 def _draw(
-    axis: Any, name: str, at: Floats, values: Floats, deviations: Floats, known: Sequence[int], slope: float | None
+    axis: Any, name: str, at: Floats, values: Floats, deviations: Floats, rows: Sequence[int], slope: float | None
 ) -> None:
-    """One parameter against one condition, which the ``known`` runs have; a line where there is a ``slope``."""
-    median, out = float(np.median(values)), np.isin(known, beyond(values.tolist(), deviations.tolist()))
+    """One parameter against one condition, which the runs at ``rows`` have; a line where there is a ``slope``."""
+    median, out = float(np.median(values)), np.isin(rows, beyond(values.tolist(), deviations.tolist()))
     reference, factor, label = 0.0, 1.0, f"{name} [{unit_of(name, 'SI')}]"
     if PARAMETERS[name].relative:
         reference, factor, label = median, 100.0 / abs(median), f"{name} − median [%]"
-    y, limit, order = values[known], BEYOND * deviations[known], np.argsort(at, kind="stable")
+    y, limit, order = values[rows], BEYOND * deviations[rows], np.argsort(at, kind="stable")
     for side in (-1.0, 1.0):
         axis.plot(at[order], factor * (median + side * limit[order] - reference), marker="_", **DASHED)
     axis.axhline(factor * (median - reference), **DASHED | {"linestyle": "-"})
     for where, marker, colour in ((~out, "o", COLOURS[0]), (out, "X", COLOURS[1])):
         axis.plot(at[where], factor * (y[where] - reference), marker, color=colour, markersize=4.5)
     if slope is not None:
-        weights = deviations[known] ** -2.0
+        weights = deviations[rows] ** -2.0
         ends = np.array([at.min(), at.max()])
         middle = (np.average(at, weights=weights), np.average(y, weights=weights))
         axis.plot(ends, factor * (middle[1] + slope * (ends - middle[0]) - reference), color=COLOURS[2])

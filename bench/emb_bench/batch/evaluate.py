@@ -34,9 +34,9 @@ FIRST = 50  # Samples whose noise distinguishes a run from any other
 
 
 def evaluate_one(source: Source, options: CampaignOptions, bench: Bench | None = None) -> Row:
-    """Evaluate one log with a bench, or else with its own.
+    """Evaluate one log with a bench; without one, with the bench inside the log.
 
-    Whatever is wrong with it becomes the row's ``error``; what was found before that stays. The bench is its content:
+    An error becomes the row's ``error``; the columns before it stay. The bench is its content:
     another machine does not have the file.
     """
     row = failed(source, "")
@@ -76,8 +76,8 @@ def _steps(source: Source, options: CampaignOptions, given: Bench | None) -> Ite
         return
     from emb_bench.estimate.methods import method_of
 
-    asked = with_systematic(EstimationProblem(**vars(question)), bench, plant)
-    method = method_of(options.method)(bench, plant, asked, starts=options.starts, seed=options.seed)
+    problem = with_systematic(EstimationProblem(**vars(question)), bench, plant)
+    method = method_of(options.method)(bench, plant, problem, starts=options.starts, seed=options.seed)
     yield _of_the_estimate(method.fit([experiment.seen_by(plant)]), log.truth)
 
 
@@ -134,17 +134,17 @@ def _beginning(experiment: Experiment) -> str | None:
 
 def _of_the_information(e: Evaluation) -> Row:
     physical = e.fisher("physical")
-    own, bounds = physical.criteria(), physical.cramer_rao()
+    criteria, bounds = physical.criteria(), physical.cramer_rao()
     identified = {finding.name: finding.identified for finding in e.identifiability().findings}
-    said = {e.log.missing, *lacks(e.experiment)}
+    stated = {e.log.missing, *lacks(e.experiment)}
     found: Row = {
-        "warnings": tuple(escaped(warning) for warning in warnings(e) if warning not in said),
+        "warnings": tuple(escaped(warning) for warning in warnings(e) if warning not in stated),
         "nominal_fits": e.fit.fits,
         "nominal_angle_sigmas": e.fit.angle,
         "nominal_velocity_sigmas": e.fit.velocity,
-        "log_det": own.log_det,
-        "lambda_min": own.lambda_min,
-        "trace_inverse": own.trace_inverse,
+        "log_det": criteria.log_det,
+        "lambda_min": criteria.lambda_min,
+        "trace_inverse": criteria.trace_inverse,
     }
     for name in e.question.names:
         true = _true(e.log.truth, name)
@@ -167,19 +167,19 @@ def _of_the_estimate(e: Estimate, truth: BrakeParameters | None) -> Row:
         "chi2_per_freedom": e.validation.ratio,
         "alarms": alarms(e),
         "caveats": tuple(caveats(e)),
-        "outside": tuple(said.label for said in conclusions if said.outside is not None),
+        "outside": tuple(conclusion.label for conclusion in conclusions if conclusion.outside is not None),
     }
     deviations, between = e.deviations(), e.between_runs()
-    for i, said in zip(e.requested(), conclusions, strict=True):
+    for i, conclusion in zip(e.requested(), conclusions, strict=True):
         name = e.unknowns[i].name
-        value, low, high, noise = said.value, *said.interval, said.repeatability
+        value, low, high, noise = conclusion.value, *conclusion.interval, conclusion.repeatability
         true = _true(truth, name)
         deviation = float(deviations[i])
         scale = deviation * (abs(value) if PARAMETERS[name].relative else 1.0)
         error = None if true is None or not 0.0 < scale < math.inf else (value - true) / scale
         found |= _of(
             name,
-            identified=said.identified,
+            identified=conclusion.identified,
             estimate=value,
             low=low,
             high=high,

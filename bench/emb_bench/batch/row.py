@@ -30,7 +30,7 @@ class Source:
     root: str  # The folder, as given on the command line; of a log given by itself, the folder it is in
     log: str  # Path relative to it
     campaign: str  # Folder of the log, relative to ``root``
-    trouble: str = ""  # Reason why it cannot be read, if that is known before it is opened; else empty
+    trouble: str = ""  # Reason why it is not opened; empty if it is
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,15 +71,15 @@ class CampaignOptions(SearchOptions):
     def origin_on(self, bench: Bench | None) -> dict[str, Any]:
         """Options that the rows depend on, for the file that has them."""
         params, nuisances = self.names_on(bench)
-        kept = {name: getattr(self, name) for name in ("model", "prior", "starts", "seed")}
+        others = {name: getattr(self, name) for name in ("model", "prior", "starts", "seed")}
         text = None if bench is None else bench.text
-        return {"method": self.method, "params": params, "nuisances": nuisances, "bench_text": text, **kept}
+        return {"method": self.method, "params": params, "nuisances": nuisances, "bench_text": text, **others}
 
 
 class Column(NamedTuple):
     """One column of the file."""
 
-    kind: str  # ``text``, ``texts``, ``truth``, ``whole``, ``number`` or ``time`` [ns]
+    kind: str  # ``text``, ``texts``, ``truth``, ``count``, ``number`` or ``time`` [ns]
     about: str  # What it is
     unit: str = ""  # Of its numbers
 
@@ -101,15 +101,15 @@ COLUMNS = {
     "start_time": Column("time", "first message, Unix time", "ns"),
     "temperature": Column("number", "mean temperature of the motor; null if the node does not send it", "degC"),
     "supply_voltage": Column("number", "mean supply voltage; null if the node does not send it", "V"),
-    "simulated": Column("truth", "no real machine was driven, by what the log says"),
+    "simulated": Column("truth", "the log is of no real machine"),
     "exit_reason": Column("text", "why the run ended"),
     "complete": Column("truth", "neither the log nor the experiment lacks anything"),
     "missing": Column("text", "what is missing, in words; empty if nothing is"),
     "warnings": Column("texts", "what else to know before a number is used"),
-    "planned": Column("whole", "periods that the run was to have", "samples"),
-    "periods": Column("whole", "periods of the experiment that are in the log", "samples"),
-    "measured": Column("whole", "periods whose sample was received", "samples"),
-    "command_delay": Column("whole", "by which commands acted late", "samples"),
+    "planned": Column("count", "periods that the run was to have", "samples"),
+    "periods": Column("count", "periods of the experiment that are in the log", "samples"),
+    "measured": Column("count", "periods whose sample was received", "samples"),
+    "command_delay": Column("count", "by which commands acted late", "samples"),
     "bench_name": Column("text", "bench that it was evaluated with"),
     "bench_hash": Column("text", "SHA-256 of that bench's contract"),
     "policy_sha256": Column("text", "SHA-256 of the policy; null if the log names none"),
@@ -118,11 +118,11 @@ COLUMNS = {
     "angle_max": Column("number", "highest measured angle", "rad"),
     "speed_max": Column("number", "largest measured speed", "rad/s"),
     "current_max": Column("number", "largest commanded current, either sign", "A"),
-    "violations": Column("whole", "samples beyond the bench's limits of angle or speed", "samples"),
-    "limited": Column("whole", "commands that the shield changed", "samples"),
-    "returning": Column("whole", "commands of the shield's way home", "samples"),
-    "clipped": Column("whole", "commands clipped to the largest current", "samples"),
-    "missed": Column("whole", "periods missed by the loop", "samples"),
+    "violations": Column("count", "samples beyond the bench's limits of angle or speed", "samples"),
+    "limited": Column("count", "commands that the shield changed", "samples"),
+    "returning": Column("count", "commands of the shield's way home", "samples"),
+    "clipped": Column("count", "commands clipped to the largest current", "samples"),
+    "missed": Column("count", "periods missed by the loop", "samples"),
     "nominal_fits": Column("truth", "the model fits at the bench's nominal parameters"),
     "nominal_angle_sigmas": Column("number", "rms error of the angle at nominal parameters", "1"),
     "nominal_velocity_sigmas": Column("number", "rms error of the velocity at nominal parameters", "1"),
@@ -180,7 +180,7 @@ def failed(source: Source, why: str) -> Row:
 def write_rows(
     path: Path, ending: str, rows: Sequence[Row], options: CampaignOptions, bench: Bench | None = None
 ) -> None:
-    """Writes a Parquet or CSV file: one row for each log, evaluated with the bench, or else with its own.
+    """Writes a Parquet or CSV file: one row for each log. ``bench`` is None if each has its own.
 
     Parquet has units in the columns' metadata and the options in the file's. CSV has neither, and the entries of a list
     with ``"; "`` between them. The same rows give the same bytes.
@@ -192,7 +192,7 @@ def write_rows(
         "text": pa.string(),
         "texts": pa.list_(pa.string()),
         "truth": pa.bool_(),
-        "whole": pa.int64(),
+        "count": pa.int64(),
         "number": pa.float64(),
         "time": pa.timestamp("ns", tz="UTC"),
     }

@@ -39,7 +39,7 @@ class ParameterEstimates:
     total: float  # Median of half the 95 % intervals, of noise, systematic errors and what the records cannot exclude
     repeatability: float  # The same, of the sensors' noise alone
     constancy: Constancy
-    over: dict[str, Slope]  # Change with time [1/h] and conditions, by name; without those that are not known
+    over: dict[str, Slope]  # Change with time [1/h] and conditions, by name; those that the logs have
     beyond: tuple[str, ...]  # Logs outside of the control chart's limits
 
 
@@ -105,11 +105,11 @@ def counting(rows: Sequence[Row]) -> list[Row]:
 
 
 def document(c: Campaign) -> dict[str, Any]:
-    """The summary as plain data; of single logs the names, and what is said of them."""
+    """The summary as plain data; of single logs their names, errors and results."""
     found: dict[str, Any] = to_json(replace(c, failed=(), copies=(), stopped=(), misfit=(), outside=()))
-    told = ("root", "log", "error", "copy_of", "exit_reason", "model", "outside")
+    keys = ("root", "log", "error", "copy_of", "exit_reason", "model", "outside")
     for name in ("failed", "copies", "stopped", "misfit", "outside"):
-        found[name] = [{key: row.get(key) for key in told} for row in getattr(c, name)]
+        found[name] = [{key: row.get(key) for key in keys} for row in getattr(c, name)]
     return found
 
 
@@ -119,12 +119,12 @@ def mark_copies(rows: Sequence[Row]) -> list[Row]:
     The first counts among equals.
     """
     best: dict[str, Row] = {}
-    told = [row for row in rows if row["error"] is None and row.get("beginning") is not None]
-    for row in told:
-        held = best.setdefault(row["beginning"], row)
-        if (row["complete"], row["measured"]) > (held["complete"], held["measured"]):
+    evaluated = [row for row in rows if row["error"] is None and row.get("beginning") is not None]
+    for row in evaluated:
+        before = best.setdefault(row["beginning"], row)
+        if (row["complete"], row["measured"]) > (before["complete"], before["measured"]):
             best[row["beginning"]] = row
-    copies = {id(row): best[row["beginning"]]["log"] for row in told if best[row["beginning"]] is not row}
+    copies = {id(row): best[row["beginning"]]["log"] for row in evaluated if best[row["beginning"]] is not row}
     return [row | {"copy_of": copies.get(id(row))} for row in rows]
 
 
@@ -166,10 +166,10 @@ def shown_as(key: str, span: float) -> tuple[str, str, float]:
 
 def condition_of(used: Sequence[Row], key: str, begun: int) -> tuple[list[int], list[float]]:
     """Places of the rows that have a column of ``CHANGES_WITH``, and its values; time counts from ``begun`` [ns]."""
-    known = [i for i, row in enumerate(used) if row.get(key) is not None]
+    places = [i for i, row in enumerate(used) if row.get(key) is not None]
     if key == "start_time":
-        return known, [(used[i][key] - begun) / HOUR for i in known]
-    return known, [used[i][key] for i in known]
+        return places, [(used[i][key] - begun) / HOUR for i in places]
+    return places, [used[i][key] for i in places]
 
 
 def _estimates(used: Sequence[Row], name: str) -> ParameterEstimates | None:
@@ -179,8 +179,8 @@ def _estimates(used: Sequence[Row], name: str) -> ParameterEstimates | None:
     values, deviations = found["estimate"], found["between_runs"].tolist()
     over = {}
     for key in CHANGES_WITH:
-        known, at = condition_of(used, key, used[0]["start_time"])
-        if (one := slope(values[known].tolist(), [deviations[i] for i in known], at)) is not None:
+        places, at = condition_of(used, key, used[0]["start_time"])
+        if (one := slope(values[places].tolist(), [deviations[i] for i in places], at)) is not None:
             over[key] = one
     return ParameterEstimates(
         runs=len(used),

@@ -81,7 +81,7 @@ def main(argv: list[str] | None = None) -> int:
         with needs("commissioning", "bench"):
             from emb_bench.commission.commissioning import Commissioning, emb_run
         each = options(args)
-        open_transport(args.iface, sheet, ())[0].close()  # what is wrong with it is said first, and before any step
+        open_transport(args.iface, sheet, ())[0].close()  # refuses a wrong bus before any step
         if "--confirm" in each and not is_interactive():
             raise UsageError("--confirm: expected a terminal on standard input; --yes runs without asking")
         try:

@@ -40,7 +40,7 @@ def emb_commission() -> int:
 
 
 def emb_hil() -> int:
-    """A command where vcan0 exists, in a kernel of its own if need be."""
+    """A command where vcan0 exists, in a kernel under this one if need be."""
     if sys.platform != "linux":
         from emb_runtime.system.terminal import complain
 

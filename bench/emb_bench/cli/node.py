@@ -1,4 +1,4 @@
-"""``emb-node``: the simulated brake on a real bus, with its own clock."""
+"""``emb-node``: the simulated brake on a real bus."""
 
 from __future__ import annotations
 

@@ -63,8 +63,8 @@ def answer(args: argparse.Namespace, document: Callable[[], Any], text: Callable
     if args.json:
         show(json_document(document()))
         return
-    said = text(args.verbose)
-    show(_verdict(said) if args.quiet else said)
+    lines = text(args.verbose)
+    show(_verdict(lines) if args.quiet else lines)
 
 
 def _verdict(text: str) -> str:

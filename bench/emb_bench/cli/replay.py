@@ -70,7 +70,7 @@ def _exit_code(study: Study, accepted: Result | None = None, *, strict: bool) ->
     from emb_bench.analysis.study import Code, verdict
 
     if not strict:
-        estimates = [own.joint for own in study.side_by_side or [study] if own.joint is not None]
+        estimates = [one.joint for one in study.side_by_side or [study] if one.joint is not None]
         misfits = [e for e in estimates if e.bench.machine is not None and not e.validation.fits]
         return EXIT_CHECK_FAILED if misfits else EXIT_DONE
     fits = EXIT_OUTSIDE if study.outside else EXIT_DONE
@@ -94,9 +94,9 @@ def _report(args: argparse.Namespace) -> int:
 
 
 def _export(args: argparse.Namespace) -> int:
-    asked = given(args, api.ExportOptions)
-    log = opened(args.run, asked.map)
-    holds = api.export(log, args.output, asked)
+    options = given(args, api.ExportOptions)
+    log = opened(args.run, options.map)
+    holds = api.export(log, args.output, options)
     warning = f"WARNING: {log.missing}\n" if log.missing else ""
     document = {"log": str(args.run), "file": str(args.output), "holds": holds, "missing": log.missing}
     answer(args, lambda: document, lambda _: f"{warning}{args.output}: {holds}")
@@ -279,7 +279,7 @@ def epilog(codes: Collection[int]) -> str:
 
 
 def parser(only: str | None = None) -> argparse.ArgumentParser:
-    """The command line, of one command where it is known."""
+    """The command line of all commands, or of ``only`` one."""
     p = Parser(
         prog="emb-replay",
         description="Evaluate logs of emb-run.",

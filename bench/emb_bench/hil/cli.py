@@ -74,7 +74,7 @@ def _run(options: argparse.Namespace, command: list[str]) -> int:
 
 def _is_up(name: str) -> bool:
     """Returns True if an interface of this process's network namespace exists and is up: netdevice(7)."""
-    if all(name != known for _, known in socket.if_nameindex()):
+    if all(name != other for _, other in socket.if_nameindex()):
         return False
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         answer = fcntl.ioctl(sock, _SIOCGIFFLAGS, struct.pack("=16sH22x", name.encode(), 0))
@@ -101,12 +101,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             os.open(os.devnull, os.O_RDWR)
     given = list(sys.argv[1:] if arguments is None else arguments)
     mark = given.index("--") if "--" in given else len(given)
-    known = parser()
+    p = parser()
     command = given[mark + 1 :]
     try:
-        if not command and (words := known.parse_known_args(given[:mark])[1]) and not words[0].startswith("-"):
+        if not command and (words := p.parse_known_args(given[:mark])[1]) and not words[0].startswith("-"):
             raise UsageError(f"{words[0]}: write the command after --, as in `emb-hil -- {shlex.join(words)}`")
-        options = known.parse_args(given[:mark])
+        options = p.parse_args(given[:mark])
         if options.memory < 128:
             raise UsageError("--memory must be at least 128 MB")
         if not 1 <= options.slow <= SLOWEST:

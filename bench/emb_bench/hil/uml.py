@@ -332,10 +332,10 @@ def supervise(start: Callable[[], KernelCommand]) -> int:
 
     The first signal is handed on with the command's grace to end in, a second one kills.
     """
-    asked: list[int] = []
+    signals: list[int] = []
 
     def note(number: int, _frame: FrameType | None) -> None:
-        asked.append(number)
+        signals.append(number)
 
     previous = {number: signal.signal(number, note) for number in SIGNALS}
     kill_at, handed_on = math.inf, 0
@@ -344,12 +344,12 @@ def supervise(start: Callable[[], KernelCommand]) -> int:
         command = start()
         while (status := command.poll()) is None:
             now = time.monotonic()
-            if len(asked) > handed_on:
+            if len(signals) > handed_on:
                 kill_at = now if handed_on else now + command.grace
-                handed_on = len(asked)
-                command.signal(asked[-1])
+                handed_on = len(signals)
+                command.signal(signals[-1])
             if now >= kill_at:
-                return 128 + asked[-1]
+                return 128 + signals[-1]
             time.sleep(_POLL)
         return status
     finally:

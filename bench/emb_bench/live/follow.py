@@ -31,7 +31,7 @@ from emb_runtime.system.input_file import open_regular
 
 
 def chunks(path: Path, wait: Callable[[], bool], bench: Callable[[bytes], object] = len) -> Iterator[Chunk]:
-    """The chunks of a log, each as soon as it is whole; ends with the log's footer.
+    """The chunks of a log, each as soon as it is complete; ends with the log's footer.
 
     ``wait`` is called where the file has no more yet, waits a little, and is False if nothing more is to be waited for.
     ``bench`` gets the bench file inside the log.
@@ -74,31 +74,31 @@ def _read(file: BinaryIO, count: int, wait: Callable[[], bool]) -> bytes | None:
     return data
 
 
-MOST_LISTED = 100  # Logs of a folder that can be chosen
+MOST_LISTED = 100  # Logs of a folder in a page's list
 
 
 class NewLogs:
     """The logs that appear in a folder, the oldest first; with ``old`` those that are there already, too.
 
-    One that is chosen comes before them.
+    The one of :meth:`choose` comes before them.
     """
 
     def __init__(self, folder: Path, pattern: str = "*.mcap", old: bool = False) -> None:
         self._folder = folder
         self._pattern = pattern
         self._seen = set() if old else set(self._logs())
-        self._chosen: Path | None = None
+        self._first: Path | None = None
 
     def next(self) -> Path | None:
         """The next log, if there is one yet."""
         new = self._new()[:1]
-        self._chosen = None
+        self._first = None
         self._seen.update(new)
         return new[0] if new else None
 
     def choose(self, name: str) -> None:
         """Let the log of a name be the next, if it is here."""
-        self._chosen = next((path for path in self._logs() if path.name == name), None)
+        self._first = next((path for path in self._logs() if path.name == name), None)
 
     @property
     def names(self) -> list[str]:
@@ -111,8 +111,8 @@ class NewLogs:
         return bool(self._new())
 
     def _new(self) -> list[Path]:
-        chosen = [] if self._chosen is None else [self._chosen]
-        return chosen + [path for path in self._logs() if path not in self._seen]
+        first = [] if self._first is None else [self._first]
+        return first + [path for path in self._logs() if path not in self._seen]
 
     def _logs(self) -> list[Path]:
         try:
@@ -127,7 +127,7 @@ def follow(
     wait: Callable[[], bool],
     complain: Callable[[LogError], object],
 ) -> None:
-    """Give a server every log that appears or is chosen, as it grows, until ``wait`` is False.
+    """Give a server every log that appears or that a page chooses, as it grows, until ``wait`` is False.
 
     ``complain`` takes what is wrong with a log; the next is followed all the same.
     """
@@ -144,7 +144,7 @@ def follow(
                 server.add(chunk)
             server.end(read_log(path).exit_reason)
         except (LogError, *UNREADABLE) as err:
-            told = LogError(f"{path}: its messages are not readable: {message_of(err)}")
-            told = err if isinstance(err, LogError) else told
-            server.end(str(told))
-            complain(told)
+            error = LogError(f"{path}: its messages are not readable: {message_of(err)}")
+            error = err if isinstance(err, LogError) else error
+            server.end(str(error))
+            complain(error)

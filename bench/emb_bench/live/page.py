@@ -73,24 +73,24 @@ class Page:
         Raises:
             TypeError, KeyError, ValueError, AttributeError, google.protobuf.message.DecodeError: it is damaged.
         """
-        said: dict[str, Any] = {"cycles": [], "estimates": [], "events": []}
+        document: dict[str, Any] = {"cycles": [], "estimates": [], "events": []}
         estimate: dict[str, dict[str, Any]] = {}
         for topic, time_ns, message in self._messages(chunk):
             if topic == "/safety":
-                said["events"].append((1e-9 * time_ns, f"{message.code} {message.text}"))
+                document["events"].append((1e-9 * time_ns, f"{message.code} {message.text}"))
             elif topic == "/estimate":
                 estimate = by_name([getattr(message, name) for name in NUMBERS], self._errors)
                 repeatability = {name: _number(share) for name, share in shares(estimate).items()}
-                said["estimates"].append({"step": message.step, "repeatability": repeatability})
+                document["estimates"].append({"step": message.step, "repeatability": repeatability})
             elif message.state in RUNNING:
                 if self._start_ns < 0:
                     self._start_ns = message.receive_time_ns
-                    said["start"] = 1e-9 * time_ns
-                said["cycles"].append(self._cycle(message))
-        return self._keep({**said, "table": [*rows(estimate)], "total": total(shares(estimate), self._errors)})
+                    document["start"] = 1e-9 * time_ns
+                document["cycles"].append(self._cycle(message))
+        return self._keep({**document, "table": [*rows(estimate)], "total": total(shares(estimate), self._errors)})
 
     def end(self, reason: str) -> str:
-        """The log is whole: the run's exit reason."""
+        """The log has ended: the run's exit reason."""
         return self._keep({"result": reason})
 
     def _messages(self, chunk: Chunk) -> Iterator[tuple[str, int, Any]]:
@@ -118,8 +118,8 @@ class Page:
             "applied": _number(c.applied_current),
         }
 
-    def _keep(self, said: dict[str, Any]) -> str:
-        self._sent.append(json.dumps(said))
+    def _keep(self, document: dict[str, Any]) -> str:
+        self._sent.append(json.dumps(document))
         return self._sent[-1]
 
 

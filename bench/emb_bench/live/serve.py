@@ -36,9 +36,11 @@ HOST = "127.0.0.1"
 PORT = 8765  # Port that viewers propose
 SUBSCRIBING = 0.1  # Time for viewers to subscribe to new topics before their first message [s]
 LINGER = 0.2  # Time for viewers to get the last messages [s]
-BACKLOG = 1 << 14  # Messages that wait for a slow viewer; a chunk has about a thousand. Then its oldest are left out.
+BACKLOG = 1 << 14  # Messages that wait for a slow viewer; a chunk has about a thousand. Then the oldest are dropped.
 MOST_WAITING = 32 << 20  # Size of them [bytes]
-MOST_SAID = 1000  # Texts that wait for a slow viewer, which is left then; a page that comes late gets ``KEPT`` at once
+MOST_TEXTS = (
+    1000  # Texts that wait for a slow viewer; with more it is closed. A page that comes late gets ``KEPT`` at once
+)
 MOST_VIEWERS = 16
 LARGEST_REQUEST = 64 << 10  # [bytes]
 OPENING, CLOSING = 2.0, 0.5  # Longest handshakes [s]
@@ -61,13 +63,13 @@ MESSAGE: Final = struct.Struct("<BIQ")  # Opcode 1, number of the subscription, 
 
 
 class Viewer:
-    """One connection: its subscriptions, and what waits to be sent by a thread of its own."""
+    """One connection: its subscriptions, and a thread that sends what waits."""
 
     def __init__(self, connection: ServerConnection, server: Server) -> None:
         self._connection = connection
         self._server = server
         self._subscriptions: dict[int, int] = {}
-        self._said: deque[str] = deque()
+        self._texts: deque[str] = deque()
         self._messages: deque[bytes] = deque()
         self._waiting = 0  # Size of the messages [bytes]
         self._news = threading.Condition()
@@ -81,8 +83,8 @@ class Viewer:
         """Send texts, before the messages that wait."""
         with self._news:
             if self._open:
-                self._said.extend(texts)
-                self._open = len(self._said) <= MOST_SAID
+                self._texts.extend(texts)
+                self._open = len(self._texts) <= MOST_TEXTS
             self._news.notify()
 
     def log(self, channel: int, time_ns: int, data: bytes) -> None:
@@ -100,8 +102,8 @@ class Viewer:
         sender = threading.Thread(target=self._send)
         sender.start()
         try:
-            for asked in self._connection:
-                self._take(asked)
+            for text in self._connection:
+                self._take(text)
         except (KeyError, TypeError, ValueError, AttributeError, RecursionError):
             pass  # it does not speak the protocol
         finally:
@@ -111,13 +113,15 @@ class Viewer:
             self._connection.close()
             sender.join()
 
-    def _take(self, asked: str | bytes) -> None:
-        document = json.loads(asked) if isinstance(asked, str) else {}
+    def _take(self, text: str | bytes) -> None:
+        document = json.loads(text) if isinstance(text, str) else {}
         if document.get("op") == "subscribe":
             new = {int(each["channelId"]): int(each["id"]) & 0xFFFFFFFF for each in document["subscriptions"]}
-            known = self._server.advertised
-            self._subscriptions = {key: value for key, value in (self._subscriptions | new).items() if key in known}
-            if unknown := new.keys() - known:
+            advertised = self._server.advertised
+            self._subscriptions = {
+                key: value for key, value in (self._subscriptions | new).items() if key in advertised
+            }
+            if unknown := new.keys() - advertised:
                 self.say(op="status", level=2, message=f"no channel is numbered {min(unknown)}")
         elif document.get("op") == "unsubscribe":
             ended = document["subscriptionIds"]
@@ -132,16 +136,16 @@ class Viewer:
         try:
             while True:
                 with self._news:
-                    self._news.wait_for(lambda: self._said or self._messages or not self._open)
+                    self._news.wait_for(lambda: self._texts or self._messages or not self._open)
                     if not self._open:
                         break
-                    waiting: list[str | bytes] = [*self._said, *self._messages]
-                    self._said.clear()
+                    waiting: list[str | bytes] = [*self._texts, *self._messages]
+                    self._texts.clear()
                     self._messages.clear()
                     self._waiting = 0
                 for each in waiting:
                     self._connection.send(each)
-            if len(self._said) > MOST_SAID:
+            if len(self._texts) > MOST_TEXTS:
                 self._connection.close(CloseCode.TRY_AGAIN_LATER, "too slow: load the page again")
         except ConnectionClosed:
             pass  # listen() ends as well
@@ -197,7 +201,7 @@ class Server:
         self._thread.start()
 
     def begin(self, name: str = "", logs: Sequence[str] = ()) -> None:
-        """Another log begins, one of some that can be asked for: its numbers of channels and schemas are its own."""
+        """Another log begins, one of those that a page may choose. It numbers channels and schemas anew."""
         self._schemas.clear()
         self._of_log.clear()
         self._to_pages(lambda: self._page.begin(name, logs))
@@ -213,7 +217,7 @@ class Server:
             return {channel["id"] for channel in self._channels.values()}
 
     def end(self, reason: str) -> None:
-        """The log is whole: the run's exit reason."""
+        """The log has ended: the run's exit reason."""
         self._to_pages(lambda: self._page.end(reason))
 
     def _to_pages(self, made: Callable[[], str]) -> None:

@@ -109,7 +109,7 @@ def cycle_summary(log: RunLog) -> CycleSummary:
 
 
 def _counted(log: RunLog, name: str) -> float:
-    """A number of the loop's own, which contains the sample that made it stop; 0 if it gave none."""
+    """A number that the loop counted, with the sample that made it stop; 0 if the log has none."""
     try:
         value = float(log.end.get(name, "0"))
     except ValueError:

@@ -1,7 +1,7 @@
-"""A log of a run: finished, cut by ``kill -9``, or damaged. All that is left is read; what is missing is named.
+"""A log of a run: finished, cut by ``kill -9``, or damaged. All that can be read is read; what is missing is named.
 
-The messages are decoded with the descriptors that the file itself carries, when they are requested: as whole
-tables, or of a long log in batches; the chunks are read again each time.
+The messages are decoded with the descriptors inside the file, when they are requested: as tables, or of a long log in
+batches. The chunks are read again each time.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class _Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Chunks:
-    """The chunks of a log that are whole, read from the file each time: a long log takes more than the memory."""
+    """The complete chunks of a log, read from the file each time: a long log takes more than the memory."""
 
     path: Path
     places: Sequence[_Place]
@@ -129,7 +129,7 @@ class _Tables(Mapping[str, Table]):
 
     def __getitem__(self, topic: str) -> Table:
         if topic not in self._decoded:
-            ByName(self._log.topics)[topic]  # or says what was meant
+            ByName(self._log.topics)[topic]  # or names the one that was meant
             self._decoded[topic] = self._log.table(topic)
         return self._decoded[topic]
 
@@ -152,7 +152,7 @@ class RunLog:
     attachments: Mapping[str, bytes]  # Attached files by name
     size: int  # Of the file [bytes]
     span: tuple[int, int]  # First and last publish time of the messages [Unix ns]
-    chunks: Chunks = field(repr=False)  # Those of the file that are whole
+    chunks: Chunks = field(repr=False)  # The complete ones of the file
     topics: Mapping[str, _Topic] = field(repr=False)  # The topics that can be decoded, by name
 
     def __repr__(self) -> str:
@@ -165,7 +165,7 @@ class RunLog:
 
     @cached_property
     def tables(self) -> Mapping[str, Table]:
-        """Messages by topic, each as a whole, which of a long log takes much memory."""
+        """Messages by topic, each topic in one table, which of a long log takes much memory."""
         return _Tables(self)
 
     def table(self, topic: str) -> Table:
@@ -177,32 +177,32 @@ class RunLog:
         parts = [part[topic] for part in self.batches(topic)]
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
-    def batches(self, *wanted: str) -> Iterator[dict[str, Table]]:
+    def batches(self, *names: str) -> Iterator[dict[str, Table]]:
         """Messages of some topics, some at a time and in the order of the file: for a log of any length.
 
-        Topics that the log does not have are left out.
+        Topics that the log does not have are skipped.
         """
-        chosen = {name: self.topics[name] for name in wanted if name in self.topics}
-        held, size, some = list[tuple[int, Chunk]](), 0, False
-        for before, chunk in self.chunks.of({topic.channel for topic in chosen.values()}):
-            held.append((before, chunk))
+        topics = {name: self.topics[name] for name in names if name in self.topics}
+        chunks, size, some = list[tuple[int, Chunk]](), 0, False
+        for before, chunk in self.chunks.of({topic.channel for topic in topics.values()}):
+            chunks.append((before, chunk))
             size += len(chunk.data)
             if size >= BATCH:
-                yield {name: self._decoded(held, name) for name in chosen}
-                held, size, some = [], 0, True
-        if held or not some:
-            yield {name: self._decoded(held, name) for name in chosen}
+                yield {name: self._decoded(chunks, name) for name in topics}
+                chunks, size, some = [], 0, True
+        if chunks or not some:
+            yield {name: self._decoded(chunks, name) for name in topics}
 
-    def _decoded(self, held: Sequence[tuple[int, Chunk]], topic: str) -> Table:
+    def _decoded(self, chunks: Sequence[tuple[int, Chunk]], topic: str) -> Table:
         """The messages of a topic in chunks, each behind the number of messages before it."""
         channel, _, factory, _ = self.topics[topic]
         headers, orders = [np.empty(0, HEADER)], [np.empty(0, np.int64)]
-        for before, chunk in held:
-            own = np.flatnonzero(chunk.headers["channel"] == channel)
-            headers.append(chunk.headers[own])
-            orders.append(before + own)
+        for before, chunk in chunks:
+            places = np.flatnonzero(chunk.headers["channel"] == channel)
+            headers.append(chunk.headers[places])
+            orders.append(before + places)
         times, order = np.concatenate(headers), np.concatenate(orders)
-        payloads = [data for _, chunk in held for data in chunk.payloads(channel)]
+        payloads = [data for _, chunk in chunks for data in chunk.payloads(channel)]
         log_time, sequence = times["log"].astype(np.int64), times["sequence"].astype(np.int64)
         if ((np.diff(log_time) == 0) & (np.diff(sequence) < 0)).any():  # equal times in an order of another tool's
             right = np.lexsort((sequence, np.cumsum(np.diff(log_time, prepend=0) != 0)))
@@ -223,8 +223,8 @@ class RunLog:
         if not self._has(topic, names):
             return ()
         channel = self.topics[topic].channel
-        own = [place for place in self.chunks.places if channel in place.channels]
-        table = self._decoded([*replace(self.chunks, places=own[-1:]).of({channel})], topic)
+        places = [place for place in self.chunks.places if channel in place.channels]
+        table = self._decoded([*replace(self.chunks, places=places[-1:]).of({channel})], topic)
         return next(zip(*(table[name][-1:].tolist() for name in names), strict=True), ())
 
     def _has(self, topic: str, names: Sequence[str]) -> bool:
@@ -257,7 +257,7 @@ class RunLog:
 
     @property
     def simulated(self) -> str:
-        """Simulation that was driven in place of a real machine, as far as the log says; empty if it names none."""
+        """Simulation in place of a real machine, by the log's metadata; empty if they name none."""
         bus = self.metadata.get("emb.drive", {}).get("bus") or self.run.get("iface", "")
         if "emb.truth" in self.metadata or bus.partition(":")[0] == "sim":
             return "a simulated brake"
@@ -353,7 +353,7 @@ class RunLog:
 
     @cached_property
     def conditions(self) -> Mapping[str, float]:
-        """Mean temperature of the motor [degC] and supply voltage [V], by name; what no frame says is left out."""
+        """Mean temperature of the motor [degC] and supply voltage [V], by name; those that some frame has."""
         return {name: float(values.mean()) for name, values in self.measured_conditions.items()}
 
     @cached_property
@@ -363,9 +363,9 @@ class RunLog:
         for name, (signal, _, _) in CONDITIONS.items():
             values = np.asarray(self.tables[topic].get(signal, ()), np.float64) if topic in self.topics else np.empty(0)
             one = load_layout().optional["EMB_Conditions"].signal(signal)
-            known = values[(values >= one.minimum) & (values <= one.maximum)]  # this way round, NaN is none
-            if known.size:
-                found[name] = known
+            valid = values[(values >= one.minimum) & (values <= one.maximum)]  # this way round, NaN is none
+            if valid.size:
+                found[name] = valid
         drive = self.drive
         return found | ({} if drive is None or not drive.conditions else self._told_by(drive))
 
@@ -391,13 +391,13 @@ class RunLog:
 
     def frames_by_unix_time(self) -> Iterator[Frame]:
         """Every frame of a log of any length, as :attr:`frames` has it but with Unix time [ns]."""
-        topics = {name: own for name, own in (("/can/rx", False), ("/can/tx", True)) if self._has(name, FRAME)}
+        topics = {name: sent for name, sent in (("/can/rx", False), ("/can/tx", True)) if self._has(name, FRAME)}
         for part in self.batches(*topics):
             rows: list[tuple[int, Frame]] = []
-            for topic, own in topics.items():
+            for topic, sent in topics.items():
                 columns = (part[topic][name].tolist() for name in ("order", *FRAME))
                 for order, identifier, data, when, extended, remote, error, dropped in zip(*columns, strict=True):
-                    rows.append((order, Frame(identifier, data, when, extended, remote, error, own, dropped)))
+                    rows.append((order, Frame(identifier, data, when, extended, remote, error, sent, dropped)))
             yield from (frame for _, frame in sorted(rows))
 
     @cached_property
@@ -424,7 +424,7 @@ class RunLog:
 
     @property
     def truth(self) -> BrakeParameters | None:
-        """The brake's true parameters, known for a simulated one; None otherwise."""
+        """The true parameters of a simulated brake; None for a real one."""
         if "emb.truth" not in self.metadata:
             return None
         record = self.metadata["emb.truth"]
@@ -457,22 +457,22 @@ Found = TypeVar("Found")
 
 def once(read: Callable[[RunLog], Found]) -> Callable[[RunLog], Found]:
     """A function of a log that is called once for each opened log; what it gives must not be changed."""
-    known: WeakKeyDictionary[RunLog, Found] = WeakKeyDictionary()
+    results: WeakKeyDictionary[RunLog, Found] = WeakKeyDictionary()
 
     @wraps(read)
     def found(log: RunLog) -> Found:
-        if log not in known:
-            known[log] = read(log)
-        return known[log]
+        if log not in results:
+            results[log] = read(log)
+        return results[log]
 
     return found
 
 
 def read_log(path: str | Path) -> RunLog:
-    """Read a log, or what is left of one.
+    """Read a log, or the readable part of one.
 
     Raises:
-        LogError: the file is empty, not MCAP or not a log of ours, or not one message is left.
+        LogError: the file is empty, not MCAP or not a log of ours, or has no readable message.
         UsageError: it cannot be read.
     """
     path = Path(path)

@@ -1,7 +1,7 @@
 """The records of an MCAP file, which may be cut or damaged, and protobuf messages of one kind as columns.
 
-A file is read from the front; its summary is never needed. Every checksum is checked. A damaged record is left out as a
-whole and named in ``missing``. Behind a record whose length is wrong nothing is read.
+A file is read from the front; its summary is never needed. Every checksum is checked. A damaged record is skipped and
+named in ``missing``. Behind a record whose length is wrong nothing is read.
 
 Files are untrusted: sizes are bounded before anything is read or unpacked. One record and one unpacked chunk are in
 memory at a time, neither larger than ``LARGEST``, and descriptions, metadata and attachments have bounds.
@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from emb_runtime.errors import LogError
 
 MAGIC = b"\x89MCAP0\r\n"
-OUR_SCHEMAS = "emb."  # Begin of the names of our schemas, by which a log is known, whoever copied it
+OUR_SCHEMAS = "emb."  # Begin of the names of our schemas: it marks a log of ours, also after a copy by another tool
 LARGEST = 8 << 20
 """Largest record, and largest chunk once unpacked [bytes]; the chunks of a log have a quarter of a MiB."""
 MOST_PACKED = 32
@@ -64,7 +64,7 @@ Integers = NDArray[np.int64]
 
 
 class OtherFormError(ValueError):
-    """A record that is whole, and of a form that MCAP allows and that is not read."""
+    """A record in a form that MCAP allows and that is not read."""
 
 
 class Chunk(NamedTuple):
@@ -102,7 +102,7 @@ class McapFile:
         self.attachments: dict[str, bytes] = {}
         self.missing: list[str] = []
         self._carried = 0  # bytes of attachments and metadata
-        self._crc: int | None = zlib.crc32(MAGIC)  # over the data, then the summary; None if some of it was left out
+        self._crc: int | None = zlib.crc32(MAGIC)  # over the data, then the summary; None if some of it was skipped
         self._data_ended = False
         if not size:
             raise LogError(f"{path}: the file is empty")
@@ -111,7 +111,7 @@ class McapFile:
             raise LogError(f"{path}: not an MCAP file")
 
     def chunks(self) -> Iterator[tuple[int, int, Chunk]]:
-        """Each chunk that is whole, with the offset and the length of its record's body in the file.
+        """Each complete chunk, with the offset and the length of its record's body in the file.
 
         Raises:
             LogError: not one of our schemas is in the file, or it carries more than any log of ours.
@@ -203,8 +203,8 @@ class McapFile:
     def _describe(self, *records: mcap.Schema | mcap.Channel) -> None:
         """Keep schemas and channels; a second one of the same number comes of damage, or of two logs in one file."""
         for record in records:
-            known: dict[int, Any] = self.schemas if isinstance(record, mcap.Schema) else self.channels
-            if known.setdefault(record.id, record) != record:
+            described: dict[int, Any] = self.schemas if isinstance(record, mcap.Schema) else self.channels
+            if described.setdefault(record.id, record) != record:
                 kind = type(record).__name__.lower()
                 self.name_missing(f"{kind} {record.id} is described twice, differently; the first counts")
         if len(self.schemas) + len(self.channels) > MOST_DESCRIBED:

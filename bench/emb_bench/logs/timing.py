@@ -29,7 +29,7 @@ INTERVALS: Mapping[str, str] = {
 
 
 class DeviceClock(NamedTuple):
-    """The node's clock against this computer's: a straight line through the arrivals over the samples' own times."""
+    """The node's clock against this computer's: a straight line through the arrivals over its time stamps."""
 
     drift: float  # Seconds of arrival per second of device time, minus one: positive where the node's clock is slow
     jitter: float  # Standard deviation of the arrivals about the line [s]
@@ -55,7 +55,7 @@ class Timing:
     missed: int  # Periods without a sample
     unanswered: int  # Samples that got no answer
     not_obeyed: int | None
-    """Answers that came too late by the node's own account; None where the log ends before the run does."""
+    """Answers that came too late, as the node counted; None where the log ends before the run does."""
     clock: DeviceClock | None  # None with fewer than three samples
 
     def interval(self, name: str) -> Floats:
@@ -79,7 +79,7 @@ class BudgetCheck(NamedTuple):
 
     @property
     def met(self) -> bool:
-        """True if the run kept to the budget."""
+        """True if the run is within the budget."""
         return self.measured is not None and self.measured <= self.budget
 
 
@@ -120,8 +120,8 @@ def timing(log: RunLog) -> Timing:
 def in_control(cycles: Table) -> NDArray[np.bool_]:
     """Mask of the control cycles of the experiment, or of the way home, itself."""
     state = cycles["state"]
-    chosen: NDArray[np.bool_] = ((state == RunState.ACTIVE) | (state == RunState.HOMING)) & (cycles["step"] >= 0)
-    return chosen
+    mask: NDArray[np.bool_] = ((state == RunState.ACTIVE) | (state == RunState.HOMING)) & (cycles["step"] >= 0)
+    return mask
 
 
 def quantiles(values: Floats) -> dict[str, float]:

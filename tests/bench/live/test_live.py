@@ -30,7 +30,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from emb_bench.live.follow import NewLogs, chunks, follow
 from emb_bench.live.page import SUBPROTOCOL
-from emb_bench.live.serve import BACKLOG, LARGEST_REQUEST, MOST_SAID, MOST_VIEWERS, MOST_WAITING, Server, Viewer
+from emb_bench.live.serve import BACKLOG, LARGEST_REQUEST, MOST_TEXTS, MOST_VIEWERS, MOST_WAITING, Server, Viewer
 from emb_bench.logs.log import read_log
 from emb_bench.logs.mcap_file import HEADER, Chunk
 from emb_runtime.cli import main as emb_run
@@ -482,7 +482,7 @@ def test_a_viewer_may_subscribe_to_what_is_advertised_and_nothing_else(server: S
 
 
 def test_one_viewer_too_many_is_told_so_and_the_others_stay(server: Server) -> None:
-    assert (MOST_VIEWERS, LARGEST_REQUEST, MOST_WAITING, MOST_SAID) == (16, 64 << 10, 32 << 20, 1000)  # SECURITY.md
+    assert (MOST_VIEWERS, LARGEST_REQUEST, MOST_WAITING, MOST_TEXTS) == (16, 64 << 10, 32 << 20, 1000)  # SECURITY.md
     with ExitStack() as held:
         viewers = [held.enter_context(connect(server.address, subprotocols=PROTOCOL)) for _ in range(MOST_VIEWERS)]
         assert all(json.loads(viewer.recv(SECONDS))["op"] == "serverInfo" for viewer in viewers)
@@ -499,9 +499,9 @@ def test_what_waits_for_a_slow_viewer_is_bounded() -> None:
         for _ in range(BACKLOG + 10 if size == 10 else 20):
             slow.log(1, 0, bytes(size))
         assert len(slow._messages) == most
-    for _ in range(2 * MOST_SAID):
+    for _ in range(2 * MOST_TEXTS):
         slow.say(op="status")
-    assert len(slow._said) == MOST_SAID + 1
+    assert len(slow._texts) == MOST_TEXTS + 1
     assert not slow._open  # it is left
 
 
