@@ -65,7 +65,7 @@ def arrow_batches(log: RunLog, topic: str) -> tuple[Any, Iterator[Any]]:
 
 
 def write_table(log: RunLog, topic: str, path: Path) -> str:
-    """Write one topic as Parquet or CSV, by the ending of the file; says what it holds.
+    """Write one topic as Parquet or CSV, by the ending of the file; returns its content in words.
 
     Parquet is as :func:`arrow_batches` describes. CSV has units in its head, bytes as hex, times in nanoseconds since
     1970.
@@ -93,7 +93,7 @@ def write_table(log: RunLog, topic: str, path: Path) -> str:
 
 
 def write_model(found: Identified, path: Path) -> str:
-    """Write a brake as a model, by the ending of the file; says which parameters it has."""
+    """Write a brake as a model, by the ending of the file; returns its parameters in words."""
     content, what = MODELS[path.suffix.lower()](found)
     with replacing(path) as beside:
         beside.write_bytes(content)
@@ -117,17 +117,17 @@ FORMATS = (*PICTURES, *TABLES, *MODELS)  # Endings of what is written
 CYCLE = "/cycle"
 
 
-def write(log: RunLog, path: Path, asked: ExportOptions, estimate: Callable[[], Study]) -> str:
-    """Write a picture, a topic as a table, or the brake as a model, by the ending of the file; says what it holds.
+def write(log: RunLog, path: Path, options: ExportOptions, estimate: Callable[[], Study]) -> str:
+    """Write a picture, a topic as a table, or the brake as a model, by the ending of the file.
 
-    The ``estimate`` is made for a model that has no other parameters.
+    Returns its content in words. The ``estimate`` is made for a model that has no other parameters.
     """
     ending = path.suffix.lower()
     require_place("--output", path, FORMATS)
-    for one in fields(asked):
+    for one in fields(options):
         endings = TABLES if one.name == "topic" else MODELS
-        if getattr(asked, one.name) != one.default and ending not in endings:
+        if getattr(options, one.name) != one.default and ending not in endings:
             raise UsageError(f"--{one.name}: expected with a file that ends in {' or '.join(endings)}, got {path}")
     if ending in MODELS:
-        return write_model(identified(log, asked, estimate), path)
-    return write_table(log, asked.topic or CYCLE, path) if ending in TABLES else draw_run(log, path)
+        return write_model(identified(log, options, estimate), path)
+    return write_table(log, options.topic or CYCLE, path) if ending in TABLES else draw_run(log, path)

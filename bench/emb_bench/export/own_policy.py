@@ -142,17 +142,17 @@ def finished(
     (port,) = graph.graph.input
     width, limit = port.type.tensor_type.shape.dim[-1].dim_value, greatest_output(kind, bench.limits)
     seen = observations(bench, width)
-    asked = source(seen)
-    if asked.size != len(seen):
-        shape = list(asked.shape[1:])
+    outputs = source(seen)
+    if outputs.size != len(seen):
+        shape = list(outputs.shape[1:])
         raise PolicyRefusedError(f"its output has the shape {shape}: expected one {kind} [{UNITS[kind]}], shape [1, 1]")
-    asked = asked.reshape(len(seen), 1)
-    for row in seen[~np.isfinite(asked[:, 0])]:
+    outputs = outputs.reshape(len(seen), 1)
+    for row in seen[~np.isfinite(outputs[:, 0])]:
         named = ", ".join(f"{name} {value:.4g}" for name, value in zip(WIDTHS[width], row.tolist(), strict=True))
         raise PolicyRefusedError(f"its {kind} is not finite for {named}")
-    wanted = np.clip(asked, -limit, limit)
-    found = _evaluated(graph, port)(seen).reshape(wanted.shape)
-    apart = np.abs(found - wanted)[:, 0] / limit
+    expected = np.clip(outputs, -limit, limit)
+    found = _evaluated(graph, port)(seen).reshape(expected.shape)
+    apart = np.abs(found - expected)[:, 0] / limit
     if not apart.max() <= APART:
         raise PolicyRefusedError(
             f"its graph differs from it by {apart.max() * limit:.3g} {UNITS[kind]}, expected rounding alone"
@@ -163,8 +163,8 @@ def finished(
             f"its {kind}s round by more than {VECTOR_TOLERANCE * limit:g} {UNITS[kind]}: scale its inputs"
         )
     fields = {"kind": kind, "inputs": WIDTHS[width], **contract}
-    data = policy_file(graph, bench, seen[alike], wanted[alike], provenance, **fields)
-    beyond = int((np.abs(asked) > limit * (1.0 + ROUNDING)).sum())
+    data = policy_file(graph, bench, seen[alike], expected[alike], provenance, **fields)
+    beyond = int((np.abs(outputs) > limit * (1.0 + ROUNDING)).sum())
     clipped = f"; {beyond} of {len(seen)} {kind}s are beyond {limit:g} {UNITS[kind]}: clipped" if beyond else ""
     return data, f"{what} ({kind} of {', '.join(WIDTHS[width])}) at {len(seen)} inputs{clipped}"
 
@@ -182,8 +182,8 @@ def _take_in(model: onnx.ModelProto, folder: Path) -> None:
             offset, length = int(place.get("offset", 0)), int(place.get("length", -1))
             data = read_bytes(folder / name, MAX_FILE_BYTES)
         except (OSError, ValueError) as err:
-            said = err.strerror if isinstance(err, OSError) else "its place is no number"
-            raise PolicyRefusedError(f"its weights in '{printable(name)}' cannot be read: {said}") from err
+            reason = err.strerror if isinstance(err, OSError) else "its place is no number"
+            raise PolicyRefusedError(f"its weights in '{printable(name)}' cannot be read: {reason}") from err
         tensor.raw_data = data[offset : offset + length if length >= 0 else None]
         del tensor.external_data[:]
         tensor.ClearField("data_location")
@@ -206,10 +206,10 @@ def _ports(model: onnx.ModelProto) -> tuple[Any, int, Any]:
     Raises:
         PolicyRefusedError: there are several, or of another type or shape than those of one number.
     """
-    held = {tensor.name for tensor in model.graph.initializer}
+    initialised = {tensor.name for tensor in model.graph.initializer}
     ports = []
     for what, found in (
-        ("input", [p for p in model.graph.input if p.name not in held]),
+        ("input", [p for p in model.graph.input if p.name not in initialised]),
         ("output", model.graph.output),
     ):
         if len(found) != 1:
@@ -217,13 +217,13 @@ def _ports(model: onnx.ModelProto) -> tuple[Any, int, Any]:
             raise PolicyRefusedError(f"expected one {what}, got {len(found)} ({names}): export the one of the policy")
         kind = found[0].type.tensor_type.elem_type
         if kind not in FLOATS:
-            said = TensorProto.DataType.Name(kind).lower()
-            raise PolicyRefusedError(f"its {what} is of type {said}: expected float32, float64 or float16")
+            kind_name = TensorProto.DataType.Name(kind).lower()
+            raise PolicyRefusedError(f"its {what} is of type {kind_name}: expected float32, float64 or float16")
         ports.append(found[0])
     shape = [d.dim_value or "N" for d in ports[0].type.tensor_type.shape.dim]
     if not 1 <= len(shape) <= 2 or shape[-1] not in WIDTHS or (len(shape) == 2 and shape[0] not in (1, "N")):
-        said = ", ".join(map(str, shape))
-        raise PolicyRefusedError(f"its input has the shape [{said}]: {PORT}, shape [1, 3] or [1, 11]")
+        sizes = ", ".join(map(str, shape))
+        raise PolicyRefusedError(f"its input has the shape [{sizes}]: {PORT}, shape [1, 3] or [1, 11]")
     return ports[0], int(shape[-1]), ports[1]
 
 
@@ -254,8 +254,8 @@ def _wrapped(model: onnx.ModelProto, port: Any, width: int, answer: Any, limit: 
         helper.make_node("Reshape", ["cast", "row"], [INSIDE + port.name]),
     ]
     after = [
-        helper.make_node("Cast", [INSIDE + answer.name], ["asked"], to=TensorProto.FLOAT),
-        helper.make_node("Reshape", ["asked", "one"], ["number"]),
+        helper.make_node("Cast", [INSIDE + answer.name], ["output"], to=TensorProto.FLOAT),
+        helper.make_node("Reshape", ["output", "one"], ["number"]),
         helper.make_node("Clip", ["number", "least", "greatest"], [OUTPUT_NAME]),
     ]
     nodes = [*before, *graph.node, *after]
@@ -284,13 +284,13 @@ def _require_small(model: onnx.ModelProto) -> None:
 
 def _of_opset(model: onnx.ModelProto) -> onnx.ModelProto:
     versions_ = {entry.domain: entry.version for entry in model.opset_import}
-    own = versions_.get("", versions_.get("ai.onnx", 0))
-    if own != OPSET:
+    version = versions_.get("", versions_.get("ai.onnx", 0))
+    if version != OPSET:
         try:
             model = bare(onnx.version_converter.convert_version(model, OPSET))
         except Exception as err:  # it has several
             raise PolicyRefusedError(
-                f"it is of opset {own}, and cannot be written in {OPSET}, the one of policies: export it with "
+                f"it is of opset {version}, and cannot be written in {OPSET}, the one of policies: export it with "
                 f"opset_version={OPSET}"
             ) from err
     del model.opset_import[:]

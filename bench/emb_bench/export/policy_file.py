@@ -43,7 +43,7 @@ def policy_file(
     model: onnx.ModelProto,
     bench: Bench,
     seen: NDArray[Any],
-    wanted: NDArray[Any],
+    expected: NDArray[Any],
     provenance: Provenance,
     **contract: Any,
 ) -> bytes:
@@ -53,7 +53,7 @@ def policy_file(
         model: the graph.
         bench: limits, sample time and horizon that it was made for.
         seen: inputs, shape [N, n].
-        wanted: outputs for them, shape [N, m]: all are compared, and some become the test vectors.
+        expected: outputs for them, shape [N, m]: all are compared, and some become the test vectors.
         provenance: its origin.
         contract: the other fields of :class:`emb_runtime.policy.contract.Contract`.
 
@@ -61,9 +61,9 @@ def policy_file(
         PolicyRefusedError: an output differs by more than the tolerance of a test vector.
     """
 
-    def with_vectors(chosen: NDArray[Any]) -> bytes:
+    def with_vectors(rows: NDArray[Any]) -> bytes:
         vectors = [
-            Vector(tuple(i), tuple(o)) for i, o in zip(seen[chosen].tolist(), wanted[chosen].tolist(), strict=True)
+            Vector(tuple(i), tuple(o)) for i, o in zip(seen[rows].tolist(), expected[rows].tolist(), strict=True)
         ]
         text = Contract(
             limits=PolicyLimits(bench.limits.current, bench.limits.angle, bench.limits.velocity),
@@ -79,8 +79,8 @@ def policy_file(
         return bytes(model.SerializeToString(deterministic=True))
 
     every = np.resize(np.arange(len(seen)), max(len(seen), MIN_VECTORS))  # a short one again, up to the least number
-    for chosen in np.array_split(every, -(-len(every) // MAX_VECTORS)):
-        load_policy(with_vectors(chosen), bench)
+    for rows in np.array_split(every, -(-len(every) // MAX_VECTORS)):
+        load_policy(with_vectors(rows), bench)
     return with_vectors(np.linspace(0, len(seen) - 1, MIN_VECTORS).astype(int))
 
 
@@ -92,8 +92,8 @@ def versions(*names: str) -> dict[str, str]:
 SEQUENCE = """policy (float[1, 3] inputs) => (float[1, 1] outputs) {
     time = Gather <axis = 1> (inputs, time_index)
     step = Mul (time, rate)
-    whole = Round (step)
-    number = Cast <to = 7> (whole)
+    rounded = Round (step)
+    number = Cast <to = 7> (rounded)
     place = Clip (number, begin, end)
     outputs = Gather <axis = 0> (currents, place)
 }"""

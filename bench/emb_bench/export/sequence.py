@@ -29,12 +29,12 @@ def read_sequence(text: str, bench: Bench) -> tuple[Floats, str]:
     """
     if (path := Path(text)).suffix.lower() == ".csv":
         try:
-            said = decode(read_bytes(path, MOST_BYTES))
+            content = decode(read_bytes(path, MOST_BYTES))
         except (OSError, UnicodeDecodeError) as err:
             why = err.strerror if isinstance(err, OSError) else "its encoding is none of UTF-8, UTF-16 and cp1252"
             raise UsageError(f"{path}: cannot read the currents: {why}") from err
-        if not said.startswith("# {"):
-            return read_profile(said, path, bench)
+        if not content.startswith("# {"):
+            return read_profile(content, path, bench)
         from emb_bench.design.report import read_design  # scipy takes its time
 
         return read_design(path, bench)
@@ -65,12 +65,12 @@ def read_profile(text: str, path: Path, bench: Bench) -> tuple[Floats, str]:
     if times[-1] > (horizon - 0.5) * period:
         raise UsageError(f"{path}: time: expected less than the horizon of {horizon * period:g} s, got {times[-1]:g} s")
     begins = period * (np.arange(horizon) + 1e-6)
-    held = current[np.searchsorted(times, begins, side="right") - 1]
-    return limited(held, bench, f"{what}, the last from {times[-1]:g} s to the end")
+    sampled = current[np.searchsorted(times, begins, side="right") - 1]
+    return limited(sampled, bench, f"{what}, the last from {times[-1]:g} s to the end")
 
 
 def limited(currents: Floats, bench: Bench, what: str) -> tuple[Floats, str]:
-    """Currents [A] for the whole horizon and within the limit; and what was done to them.
+    """Currents [A] for each sample of the horizon, within the limit; and the changes in words.
 
     Raises:
         UsageError: there is none, or more than the horizon has.

@@ -142,27 +142,29 @@ def _deployed(model: Any, bench: Bench, kind: str) -> tuple[nn.Module, tuple[int
         raise UsageError(
             "expected the model with its environment, which may scale observations: PPO.load(FILE, env=env)"
         )
-    kept = io.BytesIO()  # as its library copies a policy: copy.deepcopy cannot
-    model.policy.save(kept)
-    kept.seek(0)
-    policy = type(model.policy).load(kept, device="cpu").eval()
+    copy = io.BytesIO()  # as its library copies a policy: copy.deepcopy cannot
+    model.policy.save(copy)
+    copy.seek(0)
+    policy = type(model.policy).load(copy, device="cpu").eval()
     limit, sample_time = greatest_output(kind, bench.limits), bench.timing.sample_time
     return _Deployed(policy, model.get_vec_normalize_env(), seen[0], limit, sample_time).eval(), seen
 
 
 def _width(module: nn.Module, widths: tuple[int, ...], kind: str) -> int:
     """Number of inputs that a module takes."""
-    said = ""
+    reason = ""
     for width in widths:
         try:
             with torch.no_grad():
                 answer = module(torch.zeros(1, width))
         except Exception as err:  # whatever its operations raise
-            said = said or first_line(err)
+            reason = reason or first_line(err)
             continue
         if not isinstance(answer, Tensor):
             raise PolicyRefusedError(f"expected a function of torch, which gives a tensor, got {type(answer).__name__}")
         if answer.numel() == 1:
             return width
-        said = said or f"its output has the shape {list(answer.shape)}"  # a slice of too few numbers is empty
-    raise PolicyRefusedError(f"it gives no {kind} of a row of {' or '.join(map(str, widths))} numbers: {said}: {PORT}")
+        reason = reason or f"its output has the shape {list(answer.shape)}"  # a slice of too few numbers is empty
+    raise PolicyRefusedError(
+        f"it gives no {kind} of a row of {' or '.join(map(str, widths))} numbers: {reason}: {PORT}"
+    )
