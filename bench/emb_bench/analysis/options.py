@@ -14,6 +14,7 @@ from emb_bench.estimate.records import METHODS, STARTS, EstimationProblem, freed
 from emb_bench.information.evaluation import Question
 from emb_bench.options import Options, option
 from emb_bench.sim.open_loop import check_unknowns
+from emb_bench.sim.simulated_brake import check_near_nominal
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator.estimate import NORMAL_95
@@ -126,6 +127,8 @@ class FitOptions(SearchOptions):
         problem = EstimationProblem(**vars(self.question(bench)), known=priors, window=self.window)
         if no_unknowns := [name for name in priors if name not in problem.names]:
             raise UsageError(f"--known {', '.join(no_unknowns)}: expected one of {', '.join(problem.names)}")
+        for name in {*priors} & {*PARAMETER_NAMES}:
+            check_near_nominal(bench, name, priors[name][0], "--known ")
         problem = freed(problem, bench)
         return with_systematic(problem, bench, plant) if self.systematic == "bench" else problem
 

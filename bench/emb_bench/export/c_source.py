@@ -6,7 +6,9 @@ pair with the same steps, without the sensitivities. The C of each is in ``c/``;
 
 from __future__ import annotations
 
+import re
 import textwrap
+from collections.abc import Iterable
 from importlib.resources import files
 
 from emb_bench.export.identified import Identified
@@ -33,10 +35,18 @@ def c_source(found: Identified) -> str:
         "contact exactly. Where this file is only declared: #define BRAKE_DECLARATIONS_ONLY.",
         width=112,
     )
-    names = textwrap.fill(", ".join(one.name for one in parameters), 104, subsequent_indent="      ")
-    values = "\n".join(
-        f"  b->{one.name} = {one.value!r}; /* [{one.unit}] {one.about}; {one.known} */" for one in parameters
-    )
-    plant = part("exact.c" if found.plain else "extended.c")
-    head = part("head.c").replace("@fields@", f"  double {names};")
-    return f"/* {about} */\n{head}{plant}{part('tail.c').replace('@values@', values)}"
+    made = {
+        "fields": f"  double {_listed(one.name for one in parameters)};",
+        "values": "\n".join(
+            f"  b->{one.name} = {one.value!r}; /* [{one.unit}] {one.about}; {one.uncertainty} */" for one in parameters
+        ),
+        "least": _listed(f"{one.least:g}" for one in parameters),
+        "greatest": _listed(f"{one.greatest:g}" for one in parameters),
+    }
+    parts = "".join(map(part, ("head.c", "exact.c" if found.plain else "extended.c", "tail.c")))
+    code = re.sub(r"@(\w+)@", lambda mark: made[mark[1]], parts)
+    return f"/* {about} */\n{code}"
+
+
+def _listed(items: Iterable[str]) -> str:
+    return textwrap.fill(", ".join(items).replace("e+", "e"), 104, subsequent_indent="      ")

@@ -10,5 +10,5 @@ def dcm(found: Identified) -> str:
     lines = ["KONSERVIERUNG_FORMAT 2.0", "* Made by emb-excite", f"* parameters: {found.source}"]
     for one in (one for one in found.parameters() if one.name not in CHOSEN):
         lines += ["", f"FESTWERT {one.name}", f'   LANGNAME "{one.about}"', f'   EINHEIT_W "{one.unit}"']
-        lines += [f"   WERT {one.value!r}", f"* {one.known}", "END"]
+        lines += [f"   WERT {one.value!r}", f"* {one.uncertainty}", "END"]
     return "\n".join([*lines, ""])

@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import hashlib
 import io
-import math
 import os
 import platform
 import re
 import shutil
 import subprocess
 import sys
-import textwrap
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -81,9 +79,9 @@ def description(found: Identified, token: str) -> Element:
 
     add(TIME, "s", "time", "independent", "continuous")
     for one in parameters:
-        low = {} if math.isinf(one.least) else {"min": repr(one.least)}
         kind = "fixed" if one.name in START else "tunable"
-        add(one.name, one.unit, f"{one.about}; {one.known}", "parameter", kind, start=repr(one.value), **low)
+        ends = {"start": repr(one.value), "min": repr(one.least), "max": repr(one.greatest)}
+        add(one.name, one.unit, f"{one.about}; {one.uncertainty}", "parameter", kind, **ends)
     add("current", "A", "current of the motor, held over a step", "input", "continuous", start="0")
     outputs = [add(name, unit, about, "output", "continuous") for name, (unit, about) in OUTPUTS.items()]
     structure = SubElement(root, "ModelStructure")
@@ -115,9 +113,7 @@ def _build_description() -> Element:
 
 def _glue(found: Identified, token: str) -> str:
     """The functions of FMI around the C of the brake."""
-    lows = [0.0, *(one.least for one in found.parameters()), -math.inf]
-    least = textwrap.fill(", ".join(f"{low:g}" for low in lows), 104, subsequent_indent="    ")
-    numbers = {"current": str(len(lows) - 1), "token": token, "least": least.replace("inf", "HUGE_VAL")}
+    numbers = {"current": str(len(found.parameters()) + 1), "token": token}
     return re.sub(r"@(\w+)@", lambda mark: numbers[mark[1]], part("fmi3.c"))
 
 

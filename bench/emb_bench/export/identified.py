@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, get_type_hints
 
 import numpy as np
+from msgspec import Meta
 
 from emb_bench.analysis.options import ExportOptions
 from emb_bench.brake.motion import Floats, is_plain
-from emb_bench.brake.parameters import SI, least
+from emb_bench.brake.parameters import SI
 from emb_bench.config.plants import DEFAULT_PLANT, EULER, Mechanics
 from emb_bench.estimate.records import NORMAL_95, Unknown, searched
 from emb_bench.experiment.theta import read_theta
@@ -19,6 +20,7 @@ from emb_bench.information.evaluation import bench_for, default_model
 from emb_bench.information.identifiability import Spectrum
 from emb_bench.logs.log import RunLog
 from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.config.typed import SMALLEST
 from emb_runtime.errors import CheckFailedError, UsageError
 
 if TYPE_CHECKING:  # scipy comes with the extra [bench]
@@ -51,8 +53,10 @@ ABOUT: Mapping[str, str] = {
     "x2_0": "velocity at the start",
 }
 """Parameters of an exported brake."""
+LARGEST = 1.0 / SMALLEST  # Of a number in a bench file
 CHOSEN = ("x1_0", "x2_0", "tolerance")  # What is of a simulation, not of the brake
 UNITS = SI | {"gamma": "m", "stribeck_exponent": "1", "hysteresis_travel": "rad", "tolerance": "rad/s"}
+_HINTS = get_type_hints(BrakeParameters, include_extras=True) | get_type_hints(Mechanics, include_extras=True)
 _UNSAFE = re.compile(r"[^\w .,=+-]", re.ASCII)  # What a name must not bring into comments of C, XML and DCM
 
 
@@ -63,8 +67,9 @@ class Parameter(NamedTuple):
     value: float
     unit: str  # SI, as FMI writes it: ``N.m.s/rad``, ``kg.m2``
     about: str  # What it is, in ASCII
-    known: str  # Its 95 % interval, or why it has none, in ASCII
-    least: float  # What no value is below
+    uncertainty: str  # Its 95 % interval, or why it has none, in ASCII
+    least: float
+    greatest: float
 
 
 @dataclass(frozen=True)
@@ -100,27 +105,35 @@ class Identified:
         values = self.brake._asdict() | of_plant | dict.fromkeys(START, 0.0) | {"contact": self.contact}
         found = []
         for name in (name for name in ABOUT if name in values):
-            known = "chosen" if name in CHOSEN else "not estimated"
+            uncertainty = "chosen" if name in CHOSEN else "not estimated"
             if name in self.intervals:
-                known = "95 %: {:.5g} to {:.5g}".format(*self.intervals[name])
-            unit, low = UNITS[name].replace("·", ".").replace("²", "2"), least(name) if name in SI else 0.0
-            found.append(Parameter(name, values[name], unit, ABOUT[name], known, low))
+                uncertainty = "95 %: {:.5g} to {:.5g}".format(*self.intervals[name])
+            unit = UNITS[name].replace("·", ".").replace("²", "2")
+            found.append(Parameter(name, values[name], unit, ABOUT[name], uncertainty, *bounds(name)))
         return found
 
 
-def identified(log: RunLog, asked: ExportOptions, estimate: Callable[[], Study]) -> Identified:
+def bounds(name: str) -> tuple[float, float]:
+    """Least and greatest value of a parameter: those of a bench file, and 0 where that stands for none."""
+    hint = _HINTS.get(name)
+    meta = Meta(ge=-LARGEST) if hint is None else next(iter(hint.__metadata__))
+    low = SMALLEST if name == "J" else meta.ge or 0.0
+    return min(low, Mechanics._field_defaults.get(name, low)), meta.le or LARGEST
+
+
+def identified(log: RunLog, options: ExportOptions, estimate: Callable[[], Study]) -> Identified:
     """The brake of a log, by its estimate or by values that are given.
 
     Raises:
         CheckFailedError: the model of the estimate does not fit, or a parameter is not identified.
-        UsageError: what is asked for does not go together, or this is a machine that is no brake.
+        UsageError: two options contradict each other, or this is a machine that is no brake.
     """
-    if asked.theta is not None:
-        if asked.draw is not None:
+    if options.theta is not None:
+        if options.draw is not None:
             raise UsageError("--draw: expected the estimate of the log, whose uncertainty is known, got --theta too")
-        bench = bench_for(log, asked.bench)
-        name, brake, _ = read_theta(asked.theta, log, bench)
-        plant = bench.model(asked.model or default_model(log)[0])
+        bench = bench_for(log, options.bench)
+        name, brake, _ = read_theta(options.theta, log, bench)
+        plant = bench.model(options.model or default_model(log)[0])
         return Identified(_UNSAFE.sub("?", name), bench, brake, plant.mechanics)
     study = estimate()
     _check(study)
@@ -132,10 +145,10 @@ def identified(log: RunLog, asked: ExportOptions, estimate: Callable[[], Study])
         if effect.name == "J":
             half = NORMAL_95 * effect.size * e.theta.J
             intervals["J"] = (e.theta.J - half, e.theta.J + half)
-    z, inertia = (e.z, 1.0) if asked.draw is None else drawn(e, asked.draw)
+    z, inertia = (e.z, 1.0) if options.draw is None else drawn(e, options.draw)
     brake = e.problem.theta(z)
     values = dict(zip(e.unknowns, e.problem.values(z).tolist(), strict=True))
-    how = "" if asked.draw is None else f", drawn with seed {asked.draw}"
+    how = "" if options.draw is None else f", drawn with seed {options.draw}"
     source = _UNSAFE.sub("?", f"estimate of {log.path.name}{how}")
     mechanics, contact = e.problem.mechanics(z), values.get(Unknown("contact"), 0.0)
     return Identified(source, e.bench, brake._replace(J=brake.J * inertia), mechanics, contact, intervals)

@@ -35,7 +35,6 @@ typedef uint32_t reference;
 enum { J = 1, CURRENT = @current@, FIXED = CURRENT - 3, COUNT = CURRENT + 5 }; /* references; of FIXED on contact, start */
 typedef char in_order[offsetof(instance, b.friction_torque) == (COUNT - 1) * sizeof(double) ? 1 : -1];
 
-static const double least[] = {@least@};
 static status refuse(const instance *c, text message) {
   if (c && c->log) c->log(c->environment, ERROR, "logStatusError", message);
   return ERROR;
@@ -83,8 +82,7 @@ FMI(fmi3GetFloat64)(instance *c, const reference v[], size_t n, double x[], size
 FMI(fmi3SetFloat64)(instance *c, const reference v[], size_t n, const double x[], size_t m) {
   for (size_t k = 0; k < n; k++) {
     if (v[k] < 1 || v[k] > CURRENT || n != m) return refuse(c, "neither a parameter nor the current");
-    if (!isfinite(x[k]) || x[k] < least[v[k]]) return refuse(c, "expected a number, not below min");
-    if (v[k] == J && x[k] <= 0.0) return refuse(c, "expected J above 0");
+    if (v[k] == CURRENT ? !isfinite(x[k]) : !permitted(v[k] - J, x[k])) return refuse(c, "beyond min or max");
     if (c->running && v[k] >= FIXED && v[k] < CURRENT) return refuse(c, "contact, x1_0 and x2_0 are set before the start");
   }
   for (size_t k = 0; k < n; k++) ((double *)c)[v[k]] = x[k];

@@ -15,7 +15,7 @@ typedef struct {
 void brake_init(brake *b);  /* parameters as identified; then brake_start */
 void brake_start(brake *b); /* to x1_0 and x2_0, without current */
 /* A current [A] held for a time [s]: 0 when it has passed; else nothing has changed: 1 for a value that is not finite,
- * or J <= 0; 2 for a step that takes too many segments: too long, or with extreme parameters. */
+ * or a parameter beyond min or max; 2 for a step that takes too many segments: too long, or extreme parameters. */
 int brake_step(brake *b, double current, double dt);
 void brake_outputs(brake *b); /* outputs of the state, after a parameter has changed */
 #ifdef __cplusplus
@@ -25,6 +25,6 @@ void brake_outputs(brake *b); /* outputs of the state, after a parameter has cha
 
 #ifndef BRAKE_DECLARATIONS_ONLY
 #include <math.h>
-/* Segments of a step. One of 1 s takes at most 50,000, each parameter being at an end of what an estimate searches: by
- * the rate of the exact series 20,000, with features 49,000 of 6,000 brakes. More would take longer than 0.1 s. */
+/* Segments of a step. One of 1 s takes at most 49,000, by 6,000 brakes with each parameter at an end of its search
+ * range; by the rate of the exact series 20,000. More would take longer than 0.1 s. */
 enum { MOST = 100000 };

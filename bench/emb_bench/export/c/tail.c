@@ -19,9 +19,14 @@ void brake_init(brake *b) {
   brake_start(b);
 }
 
+static const double LEAST[] = {@least@};
+static const double GREATEST[] = {@greatest@}; /* of each parameter */
+static int permitted(unsigned k, double value) { return LEAST[k] <= value && value <= GREATEST[k]; }
+
 int brake_step(brake *b, double current, double dt) {
   const brake before = *b;
-  if (!(b->J > 0.0 && isfinite(current) && isfinite(dt) && dt >= 0.0)) return 1;
+  if (!(isfinite(current) && isfinite(dt) && dt >= 0.0)) return 1;
+  for (unsigned k = 0; k < sizeof LEAST / sizeof *LEAST; k++) if (!permitted(k, ((const double *)b)[k])) return 1;
   b->current = current;
   const int passed = advance(b, current, dt);
   brake_outputs(b);
