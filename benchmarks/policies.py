@@ -146,7 +146,7 @@ def row(name: str, one: Told, first: Told, outcome: Outcome) -> str:
             np.median(rng.choice(ratio, (RESAMPLED, len(ratio))), axis=1), [0.025, 0.975], method="nearest"
         )
         cells.append(f"{np.median(ratio):.3g} ({low:.3g} to {high:.3g})")
-    return f"| {' | '.join([*cells, str(outcome.left.sum()), str((~outcome.home).sum())])} |"
+    return f"| {' | '.join([*cells, str(outcome.violated.sum()), str((~outcome.home).sum())])} |"
 
 
 def main() -> None:

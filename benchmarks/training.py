@@ -182,7 +182,7 @@ def main() -> None:
         actors.append(outcomes["trained actor"])
         for name, o in outcomes.items():
             worth = f"{o.matrices[:, 0, 0].mean():.4e}"
-            print(f"seed {seed}, {name}: {worth}, {o.left.sum()} left, home {o.home.sum()}/40")
+            print(f"seed {seed}, {name}: {worth}, {o.violated.sum()} left, home {o.home.sum()}/40")
     if actors:
         means = [float(o.matrices[:, 0, 0].mean()) for o in actors]
         left, home = (sum(int(getattr(o, key).sum()) for o in actors) for key in ("left", "home"))

@@ -25,13 +25,13 @@ RUN = re.compile(r"(\w+=\w+ )*python ")  # What prints rows; the others are for 
 def main(texts: list[str]) -> int:
     """Run the commands and write the page after each of them; 1 if one fails or prints no row."""
     commands = dict.fromkeys(m[1] for line in PAGE.read_text("utf-8").splitlines() if (m := ROW.fullmatch(line)))
-    chosen = [c for c in commands if RUN.match(c) and (not texts or any(text in c for text in texts))]
+    selected = [c for c in commands if RUN.match(c) and (not texts or any(text in c for text in texts))]
     where = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True
     )
-    failed = not chosen
-    for command in chosen:
+    failed = not selected
+    for command in selected:
         mention(command)
         done = subprocess.run(command, shell=True, cwd=ROOT, env=where, stdout=subprocess.PIPE, text=True, check=False)
         found = [line for line in done.stdout.splitlines() if PRINTED.fullmatch(line)]
@@ -47,9 +47,9 @@ def replaced(page: str, command: str, found: list[str], commit: str) -> str:
     """The page with these rows in place of the command's."""
     lines = page.splitlines()
     at = [n for n, line in enumerate(lines) if (m := ROW.fullmatch(line)) and m[1] == command]
-    kept = [line for n, line in enumerate(lines) if n not in at[1:]]
-    kept[at[0] : at[0] + 1] = [f"{row} `{command}` | {commit} |" for row in found]
-    return "\n".join(kept) + "\n"
+    result = [line for n, line in enumerate(lines) if n not in at[1:]]
+    result[at[0] : at[0] + 1] = [f"{row} `{command}` | {commit} |" for row in found]
+    return "\n".join(result) + "\n"
 
 
 if __name__ == "__main__":

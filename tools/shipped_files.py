@@ -110,12 +110,12 @@ def _fields(kind: type) -> dict[str, tuple[Any, ...]]:
     """Type of each field of a record, with what the code says of it, and its default if it has one."""
     hints, found = get_type_hints(kind, include_extras=True), dict[str, tuple[Any, ...]]()
     ours = [base for base in reversed(kind.__mro__) if base.__module__.startswith("emb_")]
-    said = {name: line or text for base in ours for name, line, text in _FIELD.findall(inspect.getsource(base))}
+    comments = {name: line or text for base in ours for name, line, text in _FIELD.findall(inspect.getsource(base))}
     info: Any = msgspec.inspect.type_info(kind)
     for one in info.fields:
         hint = _converted(hints[one.name])
-        if one.name in said:
-            hint = Annotated[hint, msgspec.Meta(description=" ".join(said[one.name].split()))]
+        if one.name in comments:
+            hint = Annotated[hint, msgspec.Meta(description=" ".join(comments[one.name].split()))]
         found[one.name] = (hint,) if one.required else (hint, one.default)
     return found
 

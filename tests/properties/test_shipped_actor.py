@@ -40,7 +40,7 @@ def test_on_brakes_that_it_never_saw_it_returns_within_limits_with_narrower_inte
         for e in (shipped, constant(bench.limits.current))
     )
     for played in (actor, push):
-        assert (int(played.left.sum()), int(played.home.sum())) == (0, len(draws))  # the shield's doing
+        assert (int(played.violated.sum()), int(played.home.sum())) == (0, len(draws))  # the shield's doing
     brakes = [draw.brake for draw in draws]
     told, pushed = (intervals(bench, "exact", PARAMETER_NAMES, brakes, one.currents) for one in (actor, push))
     ratios = np.array([b.between_runs[:4] / a.between_runs[:4] for a, b in zip(told, pushed, strict=True)])
@@ -70,7 +70,7 @@ def test_it_runs_on_a_bench_of_ones_own_and_tells_as_much(bench: Bench) -> None:
         ranges = mine.range_set("pm50")
         policy = of_actor(load_policy(shipped_actor_path(), mine), mine)
         played = play(mine, ranges, PARAMETER_NAMES, policy, fresh_draws(ranges, 5, 4), conditions=PHYSICAL)
-        assert (int(played.left.sum()), int(played.home.sum())) == (0, 4), what
+        assert (int(played.violated.sum()), int(played.home.sum())) == (0, 4), what
         lost = own - MEASURES["D"].values(played.matrices)
         assert lost.mean() < 3.0, what  # of four parameters 8 ln 1.3 = 2.1 are the noise's
 
@@ -89,7 +89,7 @@ def test_it_runs_with_the_bench_file_that_a_commissioning_writes(tmp_path: Path)
             for e in (of_actor(policy, bench), push)
         ]
         for played in both:
-            assert (int(played.left.sum()), int(played.home.sum())) == (0, 4)
+            assert (int(played.violated.sum()), int(played.home.sum())) == (0, 4)
         more = MEASURES["D"].values(both[0].matrices) - MEASURES["D"].values(both[1].matrices)
         assert quick or (more > 1.0).all(), more  # the quick one is made for a tenth of a second
 

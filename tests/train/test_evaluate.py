@@ -63,7 +63,7 @@ def test_what_was_played_has_the_information_that_plain_python_computes_from_the
             found = fisher(BENCH, draw.brake, played.currents, kind="physical", plant=plant)
             np.testing.assert_allclose(outcome.matrices[i], found.matrix, rtol=1e-6)
             assert outcome.home[i] == played.home
-            assert outcome.left[i] == (not played.kept)
+            assert outcome.violated[i] == (not played.kept)
 
 
 def test_a_draw_depends_on_the_seed_and_its_number_alone() -> None:
@@ -84,7 +84,7 @@ def test_an_experiment_that_leaves_the_limits_keeps_what_it_had_and_is_not_home(
     while not batch.experiments.violated[0]:
         before = float(batch.newest(batch.experiments.m)[0, 0])
         batch.advance(np.array([6.0]))
-    assert (outcome.left[0], outcome.home[0], outcome.matrices[0, 0, 0]) == (True, False, before)
+    assert (outcome.violated[0], outcome.home[0], outcome.matrices[0, 0, 0]) == (True, False, before)
 
 
 def test_policies_that_cannot_be_played_are_refused(tmp_path: Path) -> None:

@@ -90,14 +90,16 @@ def parser() -> argparse.ArgumentParser:
             EVALUATE_EPILOG,
         ),
     ):
-        said = f"{summary[0].upper()}{summary[1:]}."
-        add(commands.add_parser(name, help=summary, description=said, epilog=epilog))
+        description = f"{summary[0].upper()}{summary[1:]}."
+        add(commands.add_parser(name, help=summary, description=description, epilog=epilog))
     return p
 
 
 def _add_common(p: argparse.ArgumentParser, plants: str | None, seed: str) -> None:
-    own = plants or "the preset's"
-    p.add_argument("--plant", default=plants, metavar="NAMES", help=f"plants of the bench, or 'all' (default: {own})")
+    default = plants or "the preset's"
+    p.add_argument(
+        "--plant", default=plants, metavar="NAMES", help=f"plants of the bench, or 'all' (default: {default})"
+    )
     p.add_argument(
         "--command-delay",
         type=_at_least(0),
@@ -213,8 +215,8 @@ def ppo(arguments: argparse.Namespace) -> int:
             if not what:  # and so the files of the beginning are of no use
                 for path in folder.iterdir():
                     path.unlink()
-                said = f"emb-train: interrupted; nothing was trained, {folder} is empty"
-                raise KeyboardInterrupt(said) from None
+                message = f"emb-train: interrupted; nothing was trained, {folder} is empty"
+                raise KeyboardInterrupt(message) from None
             ended = EXIT_INTERRUPTED
     draw_curve(folder, folder / CURVE)
     alone = "" if conditions.shielded else "; trained without a shield, which changes its currents on a bench"
@@ -231,19 +233,19 @@ def _settings(preset: str, given: list[str]) -> dict[str, Any]:
 
     from emb_train.training import hyper_parameters, load_preset
 
-    known, found = hyper_parameters(load_preset(preset)), dict[str, Any]()
+    values, found = hyper_parameters(load_preset(preset)), dict[str, Any]()
     for text in given:
         name, _, value = text.partition("=")
         if name in found:
             raise UsageError(f"--set: {name} is given twice: give it once")
-        if name not in known:
-            there = ", ".join(f"{n}={as_json(v)}" for n, v in known.items())
-            raise UsageError(f"--set: no hyper-parameter is called '{name}'{near(name, known)}; there are: {there}")
+        if name not in values:
+            there = ", ".join(f"{n}={as_json(v)}" for n, v in values.items())
+            raise UsageError(f"--set: no hyper-parameter is called '{name}'{near(name, values)}; there are: {there}")
         try:
             found[name] = tomllib.loads(f"value = {value}")["value"]
         except tomllib.TOMLDecodeError:
             raise UsageError(
-                f"--set: expected {name}=VALUE, such as {name}={as_json(known[name])}, got '{text}'"
+                f"--set: expected {name}=VALUE, such as {name}={as_json(values[name])}, got '{text}'"
             ) from None
     return found
 

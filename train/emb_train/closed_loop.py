@@ -4,7 +4,7 @@
 
 Time: an experiment begins with the measurement y_0. The current that answers y_k is shielded with y_k and acts during
 [k, k + 1], or later by the plant's command delay. The Fisher information is that of angle and velocity with the bench's
-noise, whatever the plant's instruments make of it.
+noise; the plant's instruments do not enter it.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Values that the rewards divide the parameters by (eq. 4.17): those of each brake, or those of the bench."""
     tracking: Positive = 1.0  # Factor of the weights of the deviation from the quintic
     command_delay: tuple[int, int] = (0, 0)
-    """Least and most samples that a command waits beside the plant's own delay, drawn for each experiment."""
+    """Least and most samples that a command waits beside the plant's delay, drawn for each experiment."""
     gain: Gain = 1.0  # Of the speed loop; less where commands act late
 
     def __post_init__(self) -> None:
@@ -95,7 +95,7 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def varies(self) -> bool:
-        """True if experiments have a delay of their own."""
+        """True if a delay is drawn for each experiment."""
         return self.command_delay[1] > 0
 
     def observation_size(self, count: int) -> int:
@@ -112,7 +112,7 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """The bench with this horizon, and a shield that covers the drawn delays as well.
 
         It covers what the bench's shield covers or what is drawn, not the sum of both: right for a plant without a
-        delay of its own.
+        delay.
         """
         timing = replace(bench.timing, horizon=self.horizon or bench.timing.horizon)
         shield = bench.shield
@@ -135,7 +135,7 @@ class Setup(NamedTuple):
     """Of the sensor monitor: until the motion has shown its sign, it limits the current to a first move."""
     mechanics: Mechanics  # Mechanics of the brakes
     instruments: Instruments  # Instruments between the brakes and the bus
-    chosen: Integers  # Indices in ``PARAMETERS`` of the n parameters whose information is collected, shape [n]
+    parameters: Integers  # Indices in ``PARAMETERS`` of the n parameters whose information is collected, shape [n]
     model: Model  # Of the estimator, the runtime's
     shielded: bool  # True if the shield has the last word; else the requested current is clipped to the limit
     angle: tuple[float, float]  # Limits [rad]
@@ -159,7 +159,7 @@ def make_setup(bench: Bench, plant: Plant, parameters: Sequence[str], conditions
         thresholds=sensor_thresholds(bench, law),
         mechanics=plant.mechanics,
         instruments=plant.instruments,
-        chosen=no_sensitivity(parameters)[0],
+        parameters=no_sensitivity(parameters)[0],
         model=make_model(bench, bench.range_set(bench.prior)),
         shielded=conditions.shielded,
         angle=bench.limits.angle,
@@ -218,7 +218,7 @@ class Experiments(NamedTuple):
 
 def no_experiments(setup: Setup, count: int, steps: int) -> Experiments:
     """N experiments of these steps that are over: each has to begin before its first step."""
-    n = len(setup.chosen)
+    n = len(setup.parameters)
     return Experiments(
         brakes=np.zeros((count, len(BrakeParameters._fields))),
         delay=np.zeros(count, np.int64),
@@ -273,13 +273,13 @@ def delayed(instruments: Instruments, delay: int, offset: float) -> Instruments:
     )
 
 
-def advance(setup: Setup, experiments: Experiments, wanted: Floats) -> None:
+def advance(setup: Setup, experiments: Experiments, requested: Floats) -> None:
     """One sample period of all experiments with requested currents [A], or target speeds [rad/s], in place."""
     for i in range(experiments.k.shape[0]):
-        advance_one(setup, experiments, i, float(wanted[i]))
+        advance_one(setup, experiments, i, float(requested[i]))
 
 
-def advance_one(setup: Setup, e: Experiments, i: int, wanted: float) -> None:
+def advance_one(setup: Setup, e: Experiments, i: int, requested: float) -> None:
     """One sample period of experiment ``i`` with a requested current [A], or a target speed [rad/s], in place."""
     law, limit, model, t_s, k = setup.law, setup.law.current, setup.model, setup.law.sample_time, int(e.k[i])
     y1, y2, u, b = float(e.y[i, 0]), float(e.y[i, 1]), e.past[i], e.brakes[i]
@@ -289,24 +289,24 @@ def advance_one(setup: Setup, e: Experiments, i: int, wanted: float) -> None:
     # The answer to the newest sample: speed loop, sensor monitor, shield
     monitor, proof, verdict, estimate = e.loops[i]
     if setup.follows:
-        wanted = current_for(model, estimate, believed(model, estimate), wanted, setup.gain)
+        requested = current_for(model, estimate, believed(model, estimate), requested, setup.gain)
     most = largest_current(law, setup.thresholds, monitor, limit)
     valid, step = setup.unproven if monitor.obeys and verdict != PROVEN else law, k
     if e.returning[i]:
-        wanted, step = 0.0, max(step, setup.late_step)
+        requested, step = 0.0, max(step, setup.late_step)
     past = float(u[0]), float(u[1]), float(u[2]), float(u[3]), float(u[4])
-    asked, e.reasons[i] = sent_current(valid, setup.shielded, y1, y2, wanted, past, step, most)
-    obeyed, sent = not math.isnan(asked), 0.0 if math.isnan(asked) else asked
+    commanded, e.reasons[i] = sent_current(valid, setup.shielded, y1, y2, requested, past, step, most)
+    obeyed, sent = not math.isnan(commanded), 0.0 if math.isnan(commanded) else commanded
 
     # The brake and its node until the next sample
     x, s, m, memory = e.x[i, k + 1], e.s[i], e.m[i, k + 1], e.memory[i]
     x[:], m[:] = e.x[i, k], e.m[i, k]
-    current = command(instruments, memory, asked)
+    current = command(instruments, memory, commanded)
     if math.isnan(current):
         current = damped_current(float(x[1]), limit, setup.damping_velocity)
     errors = float(e.noise[i, k + 1, 0]), float(e.noise[i, k + 1, 1]), float(e.noise[i, k + 1, 2])
     acting, (low, high) = current + e.errors[i, 1], setup.angle
-    y1, y2 = pass_period(setup.mechanics, instruments, brake, t_s, acting, errors, x, setup.chosen, s, memory)
+    y1, y2 = pass_period(setup.mechanics, instruments, brake, t_s, acting, errors, x, setup.parameters, s, memory)
     add_increment(m, s, setup.angle_weight, setup.velocity_weight)
     e.violated[i] = not (low <= x[0] <= high and abs(x[1]) <= setup.velocity)
     e.k[i], e.y[i, 0], e.y[i, 1], e.applied[i, k + 1] = k + 1, y1, y2, current
@@ -363,7 +363,7 @@ class Batch:
             BenchFileError: the bench has no such plant, or the shield cannot hold the limits, as under a lag and a
                 delay together.
             UsageError: a parameter is unknown or out of order, a brake of these ranges is not covered by the shield, or
-                the plant has a delay of its own beside a drawn one.
+                the plant has a delay beside a drawn one.
         """
         if not parameters or tuple(p for p in PARAMETER_NAMES if p in parameters) != tuple(parameters):
             raise UsageError(
@@ -411,7 +411,7 @@ class Batch:
             of_the_past[i] = 0
         compiled(begin_one)(self.setup, e, i)
 
-    def advance(self, wanted: Floats) -> None:
+    def advance(self, requested: Floats) -> None:
         """One sample period with the requested currents [A], or target speeds [rad/s], by the conditions; shape [N].
 
         A current that is not finite counts as 0 A, and so does a speed that is no number.
@@ -421,12 +421,12 @@ class Batch:
                 not notice: it does not check its indices.
         """
         k = self.experiments.k
-        if wanted.shape != k.shape:
+        if requested.shape != k.shape:
             acts, count = self.conditions.acts, len(k)
-            raise UsageError(f"expected one {acts} for each of the {count} experiments, got shape {wanted.shape}")
+            raise UsageError(f"expected one {acts} for each of the {count} experiments, got shape {requested.shape}")
         if (k >= self.bench.timing.horizon).any():
             raise UsageError("expected experiments that go on, got one that is over or was not begun: call reset first")
-        self._step(self.setup, self.experiments, np.ascontiguousarray(wanted, np.float64))
+        self._step(self.setup, self.experiments, np.ascontiguousarray(requested, np.float64))
 
     @cached_property
     def _step(self) -> Callable[[Setup, Experiments, Floats], None]:
@@ -450,7 +450,7 @@ class Batch:
 
     @property
     def terminated(self) -> Bools:
-        """Mask of the experiments that are over: horizon reached or limits left, shape [N]. Both are true terminals."""
+        """Mask of the experiments that are over: horizon reached or limits violated, shape [N]; both true terminals."""
         return self.experiments.violated | (self.experiments.k >= self.bench.timing.horizon)
 
     @property
@@ -503,9 +503,9 @@ class Batch:
     def info(self) -> dict[str, NDArray[Any]]:
         """Outputs of an environment beside the observation, each with N as its first dimension; all of them copies."""
         e = self.experiments
-        kept = {"current": e.past[:, 0], "reasons": e.reasons, "violated": e.violated, "home": self.home}
-        own: dict[str, NDArray[Any]] = {"critic": self.critic_observation(), "fim": self.newest(e.m)}
-        return own | {name: values.copy() for name, values in kept.items()}
+        views = {"current": e.past[:, 0], "reasons": e.reasons, "violated": e.violated, "home": self.home}
+        made: dict[str, NDArray[Any]] = {"critic": self.critic_observation(), "fim": self.newest(e.m)}
+        return made | {name: values.copy() for name, values in views.items()}
 
     def critic_observation(self) -> NDArray[np.float32]:
         """Observation of the critic: the true state in fixed scales of order one, shape [N, size].
@@ -558,10 +558,10 @@ def require_possible(bench: Bench, ranges: Ranges, plant: Plant, conditions: Con
             f"{getattr(ranges.high, name):g}, the shield's set '{box.name}' covers {getattr(box.low, name):g} to "
             f"{getattr(box.high, name):g}: narrow the first or widen the second in the bench file"
         )
-    own, drawn = plant.instruments.command_delay + plant.instruments.measurement_delay, conditions.command_delay[1]
-    if conditions.shielded and own > 0 and drawn > 0:
+    of_plant, drawn = plant.instruments.command_delay + plant.instruments.measurement_delay, conditions.command_delay[1]
+    if conditions.shielded and of_plant > 0 and drawn > 0:
         raise UsageError(
-            f"the plant '{plant.name}' has a delay of its own, and the shield covers that or the drawn one, not their "
+            f"the plant '{plant.name}' has a delay, and the shield covers that or the drawn one, not their "
             "sum: draw none, or choose another plant"
         )
     if (most := plant.instruments.command_delay + drawn) > LONGEST_DELAY:

@@ -72,7 +72,7 @@ class EmbExcitationVectorEnv(gymnasium.vector.VectorEnv[Observations, Observatio
             bench: the bench; without one, the shipped one.
             ranges: name of the set of the bench that brakes are drawn from.
             parameters: whose Fisher information is collected.
-            reward: reward of a step, or of a whole experiment; a time needs conditions with the estimate.
+            reward: of a step, or of an experiment at its end; a time needs conditions with the estimate.
             scale: its factor, which brings a return to a number that a network fits.
             plant: which of the bench's plants the brakes are.
             conditions: shield or none, number of steps, observation, kind of information.
@@ -135,8 +135,8 @@ class EmbExcitationVectorEnv(gymnasium.vector.VectorEnv[Observations, Observatio
         """:meth:`step` without a new beginning: an experiment that is over has to begin before the next step."""
         limits = self.batch.bench.limits
         limit = limits.velocity if self.batch.conditions.acts == "speed" else limits.current
-        wanted: Floats = limit * np.clip(np.asarray(actions, np.float64).reshape(-1), -1.0, 1.0)  # NaN stays NaN
-        self.batch.advance(wanted)
+        requested: Floats = limit * np.clip(np.asarray(actions, np.float64).reshape(-1), -1.0, 1.0)  # NaN stays NaN
+        self.batch.advance(requested)
         rewards = self._scale * worth(self._reward, self.batch)
         terminated = self.batch.terminated
         return self.batch.observation(), rewards, terminated, np.zeros_like(terminated), self.batch.info()

@@ -61,7 +61,7 @@ def open_subject(given: str, bench_file: Path | None) -> Subject:
 
     Args:
         given: folder of a training, its plan, an ONNX file, or ``actor`` for the shipped one.
-        bench_file: bench of what has none of its own, as a plan outside such a folder; the shipped one without.
+        bench_file: bench of a policy without one, as of a plan outside such a folder; the shipped one without.
 
     Raises:
         UsageError: there is nothing of that kind, or it sees what no bench measures, or is damaged.
@@ -72,18 +72,18 @@ def open_subject(given: str, bench_file: Path | None) -> Subject:
     torch.set_num_threads(1)  # more would get into each other's way at this size, and change the last digits
     if given == ACTOR or path.suffix == ".onnx":
         return _file(given, shipped_actor_path() if given == ACTOR else path, load_bench(bench_file))
-    own = (path if path.is_dir() else path.parent) / BENCH
-    if own.exists() and bench_file is not None:
+    bench_beside = (path if path.is_dir() else path.parent) / BENCH
+    if bench_beside.exists() and bench_file is not None:
         raise UsageError(f"--bench: {given} is evaluated on the bench that it was trained on; leave it out")
     if path.suffix == ".json":
-        plan, bench = load_plan(path), load_bench(own if own.exists() else bench_file)
+        plan, bench = load_plan(path), load_bench(bench_beside if bench_beside.exists() else bench_file)
         return Subject(given, bench, of_actor(Planned(plan.speeds, bench, plan.gain), bench), plan.ranges)
     if not path.is_dir():
         hint = near(given, [ACTOR]) or near_file(path)
         raise UsageError(f"{given}: expected '{ACTOR}', an .onnx file, the folder of a training or its {PLAN}{hint}")
-    if not own.exists() or not (path / ONNX).exists():
+    if not bench_beside.exists() or not (path / ONNX).exists():
         raise UsageError(f"{given}: expected the folder of emb-train ppo, with {ONNX} and {BENCH}")
-    return _file(given, path / ONNX, load_bench(own), trained_on=own)
+    return _file(given, path / ONNX, load_bench(bench_beside), trained_on=bench_beside)
 
 
 def _file(name: str, path: Path, bench: Bench, trained_on: Path | None = None) -> Subject:
@@ -132,7 +132,7 @@ class Row:
     against_optimum: Score | None
     """Mean share of the optimum over the draws that have one, see :meth:`emb_train.play.Measure.shares`."""
     first_ahead_by: Score  # Mean lead of the first policy, paired by draw
-    left: int  # Experiments that left the limits, and were stopped there
+    left: int  # Experiments that violated the limits, and were stopped there
     home: int  # Experiments that ended at home
     values: Floats  # The measure of each draw, shape [draws]
 
@@ -165,7 +165,7 @@ def evaluate(bench: Bench, settings: Settings, subjects: Sequence[Subject], tell
     brakes = [middle_of(ranges), *(draw.brake for draw in draws[: settings.optimum])]
     excitations = {**{s.name: s.excitation for s in subjects}, **references(bench)}
     found: dict[str, PlantResult] = {}
-    known = {"": np.empty(0)}
+    optima_of = {"": np.empty(0)}
     try:
         for plant in settings.plants:
             outcomes = {}
@@ -173,12 +173,12 @@ def evaluate(bench: Bench, settings: Settings, subjects: Sequence[Subject], tell
                 tell(f"plant {plant}: {name}")
                 outcomes[name] = play(bench, ranges, names, excitation, draws, plant, settings.conditions)
             model = searchable(bench.plant(plant)) if settings.optimum else ""
-            if model not in known:
-                known[model] = optima(bench, measure, names, model, brakes, tell)[1:]
+            if model not in optima_of:
+                optima_of[model] = optima(bench, measure, names, model, brakes, tell)[1:]
             drawn = [draw.brake for draw in draws]
             with processes() if isinstance(measure.goal, IntervalCriterion) else nullcontext() as pool:
                 values = measure.of_outcomes(bench, plant, names, drawn, list(outcomes.values()), pool)
-            found[plant] = result(measure, outcomes, values, len(subjects), known[model])
+            found[plant] = result(measure, outcomes, values, len(subjects), optima_of[model])
     except KeyboardInterrupt:
         if not found:
             raise
@@ -193,8 +193,8 @@ def result(
     for (name, o), values in zip(outcomes.items(), of_all, strict=True):
         share = mean_score(measure.shares(values[: len(best)], best)) if len(best) else None
         ahead = mean_score((rows[0].values if rows else values) - values)
-        learned, left, home = len(rows) < policies, int(o.left.sum()), int(o.home.sum())
-        rows.append(Row(name, learned, mean_score(values), share, ahead, left, home, values))
+        learned, violations, home = len(rows) < policies, int(o.violated.sum()), int(o.home.sum())
+        rows.append(Row(name, learned, mean_score(values), share, ahead, violations, home, values))
     means = np.array([row.measure.value for row in rows])
     over = mean_score(means[:policies]) if policies > 1 else None
     return PlantResult(best, rows[policies + int(np.argmax(means[policies:]))].name, over, tuple(rows))
@@ -222,8 +222,8 @@ def text(settings: Settings, results: Mapping[str, PlantResult]) -> str:
 
 def _scene(a: Settings) -> str:
     c = a.conditions
-    own = (
-        f" Each experiment has its own delay of commands, {c.command_delay[0]} to {c.command_delay[1]} samples, which "
+    delays = (
+        f" Each experiment draws a delay of commands, {c.command_delay[0]} to {c.command_delay[1]} samples, which "
         "the shield covers."
     )
     return (
@@ -231,7 +231,7 @@ def _scene(a: Settings) -> str:
         f"ranges '{a.ranges}' for evaluation alone, seed {a.seed}; the same brakes and noise for all, all behind the "
         f"same shield. Brackets are 95 % intervals over the draws. 'left': experiments that left the limits and were "
         "stopped there; 'home': share that ended at the origin; 'ahead': the first policy's measure minus that of the "
-        f"line, paired by draw.{own if c.varies else ''}"
+        f"line, paired by draw.{delays if c.varies else ''}"
     )
 
 
@@ -275,7 +275,7 @@ def _verdict(measure: Measure, plant: PlantResult) -> str:
 def document(settings: Settings, results: Mapping[str, PlantResult]) -> dict[str, Any]:
     """The JSON document; what is not there is null."""
     measure = settings.measure
-    kept = {name: getattr(settings, name) for name in ("parameters", "ranges", "draws", "seed")}
+    of_settings = {name: getattr(settings, name) for name in ("parameters", "ranges", "draws", "seed")}
     of_measure = {"measure": measure.name, "measure_is": measure.label, "unit": UNIT[measure.against]}
     conditions = msgspec.structs.asdict(settings.conditions)
-    return {**of_measure, **to_json({**kept, "conditions": conditions, "plants": results})}
+    return {**of_measure, **to_json({**of_settings, "conditions": conditions, "plants": results})}

@@ -28,14 +28,14 @@ def intervals(
 ) -> list[Interval]:
     """The interval that each of N experiments will lead to, from its brake and the currents that acted [A].
 
-    Shape (N, horizon), or N rows of their own lengths. The ``pool`` has processes that share the work.
+    Shape (N, horizon), or N rows of any lengths. The ``pool`` has processes that share the work.
     """
     work = partial(_interval, bench, bench.model(plant), Question(tuple(parameters)))
     return list(map(work, brakes, currents) if pool is None else pool.map(work, brakes, currents, chunksize=PIECE))
 
 
-def _interval(bench: Bench, plant: Plant, asked: Question, brake: BrakeParameters, currents: Floats) -> Interval:
-    return of_experiment(bench, plant, brake, sampled(bench, plant, currents), asked)
+def _interval(bench: Bench, plant: Plant, question: Question, brake: BrakeParameters, currents: Floats) -> Interval:
+    return of_experiment(bench, plant, brake, sampled(bench, plant, currents), question)
 
 
 def finite(values: Sequence[float]) -> Floats:

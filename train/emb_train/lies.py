@@ -114,6 +114,6 @@ def judge(model: BalanceModel, x: Floats, v: Floats, u: Floats, found: Floats) -
         state = begin(x[i, 0], v[i, 0])
         for k in range(u.shape[1]):
             state = take(model, state, True, x[i, k + 1], v[i, k + 1], u[i, k])
-        left, allowed = unexplained(model, state)
+        residual, allowed = unexplained(model, state)
         place, most = origin(model, state)
-        found[i] = max(left / allowed, abs(place) / most) if allowed < math.inf else 0.0
+        found[i] = max(residual / allowed, abs(place) / most) if allowed < math.inf else 0.0

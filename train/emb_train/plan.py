@@ -110,7 +110,7 @@ def play(env: EmbExcitationVectorEnv, seeds: Sequence[int], actions: Floats) -> 
 
 def search(
     compared: Compared,
-    asked: PlanSearch,
+    options: PlanSearch,
     rng: np.random.Generator,
     show: Callable[[Found], object] = lambda found: None,
 ) -> Floats:
@@ -118,14 +118,14 @@ def search(
 
     Args:
         compared: brakes.
-        asked: how far to look.
+        options: how far to look.
         rng: of the plans.
         show: called after each comparison.
 
     Returns:
         The best plan of the last search on its brakes; shape [2 n].
     """
-    found, levels = Found(0, -np.inf, np.zeros(2 * asked.levels)), asked.levels
+    found, levels = Found(0, -np.inf, np.zeros(2 * options.levels)), options.levels
 
     def returns_of(plans: Floats) -> Floats:
         nonlocal found
@@ -136,28 +136,28 @@ def search(
         show(found)
         return returns
 
-    plans = rng.uniform(-1.0, 1.0, (-(-asked.drawn // compared.most), compared.most, 2 * levels))
+    plans = rng.uniform(-1.0, 1.0, (-(-options.drawn // compared.most), compared.most, 2 * levels))
     of_levels = plans[..., :levels]
     plans[..., :levels] = np.where(rng.random(of_levels.shape) < 0.5, np.sign(of_levels), CREEP * of_levels)
     returns = np.concatenate([returns_of(some) for some in plans])
-    options: dict[str, Any] = {
-        "popsize": asked.population, "bounds": [-BOUND, BOUND], "verbose": -9, "seed": np.nan,
+    cma_options: dict[str, Any] = {
+        "popsize": options.population, "bounds": [-BOUND, BOUND], "verbose": -9, "seed": np.nan,
         "randn": lambda *shape: rng.standard_normal(shape),
     }  # fmt: skip
-    best = plans.reshape(-1, 2 * levels)[np.argsort(-returns)[: asked.starts]]
-    searches: list[Any] = [cma.CMAEvolutionStrategy(begin, asked.spread, options) for begin in best]
-    for left in halvings(asked.starts):
+    best = plans.reshape(-1, 2 * levels)[np.argsort(-returns)[: options.starts]]
+    searches: list[Any] = [cma.CMAEvolutionStrategy(begin, options.spread, cma_options) for begin in best]
+    for count in halvings(options.starts):
         found = found._replace(best=-np.inf)  # there are more brakes now
-        for _ in range(asked.steps):
+        for _ in range(options.steps):
             asks = np.array([strategy.ask() for strategy in searches])
-            returns = returns_of(asks.reshape(-1, 2 * levels)).reshape(len(searches), asked.population)
-            for strategy, own, of_own in zip(searches, asks, returns, strict=True):
-                strategy.tell(list(own), (-of_own).tolist())
+            returns = returns_of(asks.reshape(-1, 2 * levels)).reshape(len(searches), options.population)
+            for strategy, candidates, values in zip(searches, asks, returns, strict=True):
+                strategy.tell(list(candidates), (-values).tolist())
         best_first = np.argsort(-returns.max(axis=1), kind="stable")
-        searches = [searches[k] for k in best_first[: -(-left // 2)]]
+        searches = [searches[k] for k in best_first[: -(-count // 2)]]
     return np.clip(found.numbers, -1.0, 1.0)
 
 
 def halvings(starts: int) -> list[int]:
-    """Searches that are left in each round: all, half of them, ..., one."""
+    """Number of searches in each round: all, half of them, ..., one."""
     return [starts, *halvings(-(-starts // 2))] if starts > 1 else [1]

@@ -58,12 +58,12 @@ def of_actor(actor: Actor, bench: Bench) -> Excitation:
     def excitation(seen: Seen) -> Currents:
         if seen[0, STEP] == 0.0:
             estimators[:] = [Estimator(bench) for _ in seen]
-        wanted: Currents = np.zeros(len(seen))
+        requested: Currents = np.zeros(len(seen))
         for i, (estimator, row) in enumerate(zip(estimators, seen.tolist(), strict=True)):
             angle, velocity, step, applied = row
             estimator.take(angle, velocity, step, applied)
-            wanted[i] = actor.act(angle, velocity, step, estimator)
-        return wanted
+            requested[i] = actor.act(angle, velocity, step, estimator)
+        return requested
 
     return excitation
 
@@ -105,10 +105,10 @@ class Outcome:
     """Final results of N experiments. One that leaves the limits is stopped there, as on the bench."""
 
     matrices: Floats
-    """Fisher information without a prior, relative to the true parameters, shape [N, n, n]. Of an experiment that left
-    the limits: that before it left them."""
-    left: Bools  # Mask of the experiments that left the limits, shape [N]
-    home: Bools  # Mask of the experiments that ended at home without having left the limits, shape [N]
+    """Fisher information without a prior, relative to the true parameters, shape [N, n, n]. Of an experiment that
+    violated the limits: that before."""
+    violated: Bools  # Mask of the experiments that violated the limits, shape [N]
+    home: Bools  # Mask of the experiments that ended at home without a violation, shape [N]
     currents: Floats  # Currents that acted in each period, 0 after an early end [A], shape [N, horizon]
 
 
@@ -129,18 +129,18 @@ def play(
     """
     batch = Batch(bench, ranges, parameters, len(draws), plant, conditions)
     begin_all(batch, draws)
-    e, left, kept = batch.experiments, np.zeros(len(draws), np.bool_), np.zeros(len(draws), np.int64)
+    e, violated, steps_inside = batch.experiments, np.zeros(len(draws), np.bool_), np.zeros(len(draws), np.int64)
     steps = np.arange(batch.bench.timing.horizon)
     for k in steps:
-        wanted = excitation(batch.seen())
-        if not np.isfinite(wanted[~left]).all():
+        requested = excitation(batch.seen())
+        if not np.isfinite(requested[~violated]).all():
             raise PolicyRefusedError(f"its current is not finite at step {k}: it cannot be played")
-        batch.advance(wanted)
-        left |= batch.experiments.violated
-        kept += ~left
-    matrices = unpack(e.m[np.arange(len(draws)), kept], len(parameters))
-    currents = np.where(steps < kept[:, None], e.applied[:, 1:], 0.0)
-    return Outcome(matrices, left, batch.home & ~left, currents)
+        batch.advance(requested)
+        violated |= batch.experiments.violated
+        steps_inside += ~violated
+    matrices = unpack(e.m[np.arange(len(draws)), steps_inside], len(parameters))
+    currents = np.where(steps < steps_inside[:, None], e.applied[:, 1:], 0.0)
+    return Outcome(matrices, violated, batch.home & ~violated, currents)
 
 
 def begin_all(batch: Batch, draws: Sequence[Draw]) -> None:

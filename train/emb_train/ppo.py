@@ -45,7 +45,7 @@ class TrainingDivergedError(EmbError):
 class Algorithm(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The hyper-parameters of the algorithm as it is published."""
 
-    total_steps: Count  # Environment steps of the whole training; rounded up to whole iterations
+    total_steps: Count  # Environment steps of the training; rounded up to a multiple of an iteration's
     envs: Count = 256  # N, experiments that run side by side
     rollout: Count = 500  # T, steps of each in one iteration
     minibatch: Count = 8192  # Samples per gradient step
@@ -66,7 +66,7 @@ class Ppo(Algorithm, frozen=True, forbid_unknown_fields=True, kw_only=True):
     initial_deviation: Positive = 0.5  # The untrained action's standard deviation, part of the limit
     noise_memory: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)] = 0.0
     """Correlation of the exploration noise from one step to the next, see :func:`exploration_noise`."""
-    noise_hold: Count = 1  # Steps for which a value of the exploration noise is held; one step of these is learned from
+    noise_hold: Count = 1  # Steps for which the exploration noise keeps a value; one step of these is learned from
     final_deviation: Positive | None = None
     """The action's standard deviation falls linearly to this one over the training; None learns it."""
     clone_steps: Count = 6000  # Gradient steps of the cloning of a plan
@@ -82,7 +82,7 @@ class Ppo(Algorithm, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     @property
     def iterations(self) -> int:
-        """Whole iterations that make at least the steps of the whole training."""
+        """Least number of iterations that make the steps of the training."""
         return -(-self.total_steps // self.batch)
 
 
@@ -116,7 +116,7 @@ class TimeAndEstimate(nn.Module):
     """Features of an observation with the estimate: soft steps in time, and in each of the four estimates.
 
     A plan changes its speed from one sample to the next. Steps spread over the experiment let a network do so from the
-    start. The measured sample and the estimate's deviations are left out: under clock jitter the deviations jump.
+    start. The measured sample and the estimate's deviations are no features: under clock jitter the deviations jump.
     """
 
     scale: Tensor
@@ -137,7 +137,7 @@ class TimeAndEstimate(nn.Module):
         return torch.tanh(nn.functional.linear(observation[:, SEEN], self.scale, self.shift))
 
     def layers(self, sample_time: float) -> list[nn.Module]:
-        """Layers with the same outputs, for whole observations with the time [s] in place of the step."""
+        """Layers with the same outputs, for all of an observation, with the time [s] in place of the step."""
         weight = torch.zeros(len(self.shift), self._inputs)
         weight[:, SEEN] = self.scale
         return [linear(weight, self.shift, sample_time), nn.Tanh()]
@@ -248,8 +248,8 @@ class DeployedActor(nn.Module):
     def forward(self, observation: Tensor) -> Tensor:
         """Currents [A] or speeds [rad/s] within ±limit, shape [N, 1], for raw observations, shape [N, I]."""
         action = self.layers(observation)
-        wanted = self.limit / math.sinh(FINENESS) * torch.sinh(action) if self.speed else self.limit * action
-        return torch.clamp(wanted, -self.limit, self.limit)
+        requested = self.limit / math.sinh(FINENESS) * torch.sinh(action) if self.speed else self.limit * action
+        return torch.clamp(requested, -self.limit, self.limit)
 
 
 def clone(actor: Actor, speeds: Sequence[float], bench: Bench, ppo: Ppo, generator: torch.Generator) -> None:
@@ -262,14 +262,14 @@ def clone(actor: Actor, speeds: Sequence[float], bench: Bench, ppo: Ppo, generat
         ppo: number of steps, and learning rate, of the cloning.
         generator: of the estimates.
     """
-    wanted = actor.action(torch.tensor(speeds, dtype=torch.float32))
-    time, nominal = torch.arange(len(wanted), dtype=torch.float32)[:, None], torch.tensor(nominal_of(bench))
+    actions = actor.action(torch.tensor(speeds, dtype=torch.float32))
+    time, nominal = torch.arange(len(actions), dtype=torch.float32)[:, None], torch.tensor(nominal_of(bench))
     optimiser = torch.optim.Adam(actor.layers.parameters(), ppo.clone_rate, fused=True)
     for step in range(ppo.clone_steps):
         optimiser.param_groups[0]["lr"] = ppo.clone_rate * (1.0 - step / ppo.clone_steps)
-        estimate = nominal * (0.5 + torch.rand(len(wanted), len(nominal), generator=generator))
-        seen = torch.cat([torch.zeros(len(wanted), 2), time, estimate, torch.zeros_like(estimate)], 1)
-        loss = (actor(seen)[:, 0] - wanted).square().mean()
+        estimate = nominal * (0.5 + torch.rand(len(actions), len(nominal), generator=generator))
+        seen = torch.cat([torch.zeros(len(actions), 2), time, estimate, torch.zeros_like(estimate)], 1)
+        loss = (actor(seen)[:, 0] - actions).square().mean()
         optimiser.zero_grad()
         torch.autograd.backward(loss)
         optimiser.step()
@@ -296,7 +296,7 @@ class _Tanh(torch.autograd.Function):
 
 
 class Tanh(nn.Module):
-    """tanh by the logistic function: torch takes several times as long for its own, a quarter of a training."""
+    """tanh by the logistic function: that of torch takes several times as long, a quarter of a training."""
 
     def forward(self, x: Tensor) -> Tensor:
         """Of each element."""
@@ -327,14 +327,14 @@ class Rollout:
     log_densities: Tensor  # Log π(a | o) of these actions, shape [T, N]
     rewards: Tensor  # Shape [T, N]
     terminals: Tensor  # 1 where the step ended its experiment, shape [T, N]
-    strayed: Tensor  # 1 where the step left the limits, shape [T, N]
+    strayed: Tensor  # 1 where the step violated the limits, shape [T, N]
     homes: Tensor  # 1 where the step ended its experiment at home, shape [T, N]
     mean_return: float
     """Sum of the rewards per experiment that ended; that began, where the rollout is shorter than an experiment."""
 
     @property
     def counts(self) -> dict[str, int]:
-        """Experiments that ended, that left the limits, and that ended at home."""
+        """Experiments that ended, that violated the limits, and that ended at home."""
         of = {"ended": self.terminals, "violations": self.strayed, "home": self.homes}
         return {name: int(where.sum()) for name, where in of.items()}
 
@@ -362,7 +362,7 @@ def train(envs: Sequence[EmbExcitationVectorEnv], actor: Actor, ppo: Ppo, seed: 
         After each iteration, its results.
 
     Raises:
-        TrainingDivergedError: something is not finite any more, or for long every experiment has left the limits.
+        TrainingDivergedError: something is not finite any more, or for long every experiment has violated the limits.
     """
     torch.set_num_threads(1)  # networks this small lose more by sharing out a product than they win
     critic = Critic(envs[0].batch.critic_observation().shape[1], ppo.hidden, 0.01 if ppo.pairs else 1.0)
@@ -372,10 +372,10 @@ def train(envs: Sequence[EmbExcitationVectorEnv], actor: Actor, ppo: Ppo, seed: 
     for iteration in range(ppo.iterations):
         draws = np.random.SeedSequence([seed, iteration]).generate_state(ppo.envs + 1, np.uint64).tolist()
         generator = torch.Generator().manual_seed(draws.pop() >> 1)
-        left = 1.0 - iteration / ppo.iterations
-        optimiser.param_groups[0]["lr"] = ppo.learning_rate * left
+        remaining = 1.0 - iteration / ppo.iterations
+        optimiser.param_groups[0]["lr"] = ppo.learning_rate * remaining
         if ppo.final_deviation is not None:
-            deviation = ppo.final_deviation + left * (ppo.initial_deviation - ppo.final_deviation)
+            deviation = ppo.final_deviation + remaining * (ppo.initial_deviation - ppo.final_deviation)
             actor.log_deviation.fill_(math.log(deviation))
         rollout = collect_all(envs, actor, ppo, draws, generator)
         losses = improve(actor, critic, optimiser, rollout, ppo, generator)
@@ -409,13 +409,13 @@ def collect_all(
     """The rollouts of all environments side by side, each with its share of the seeds; see :func:`collect`."""
     noise = [exploration_noise(ppo.rollout, e.num_envs, ppo.noise_memory, generator, ppo.noise_hold) for e in envs]
     each = len(seeds) // len(envs)
-    own = [list(seeds[i : i + each]) for i in range(0, len(seeds), each)]
+    seeds_of = [list(seeds[i : i + each]) for i in range(0, len(seeds), each)]
     if not ppo.pairs:
-        return joined(at_once(collect, envs, [actor] * len(envs), noise, own))
-    for of_env, values in zip(own, noise, strict=True):
+        return joined(at_once(collect, envs, [actor] * len(envs), noise, seeds_of))
+    for of_env, values in zip(seeds_of, noise, strict=True):
         half = len(of_env) // 2
         of_env[half:], values[:, half:] = of_env[:half], -values[:, :half]
-    return joined([against_mean(found) for found in at_once(collect, envs, [actor] * len(envs), noise, own)])
+    return joined([against_mean(found) for found in at_once(collect, envs, [actor] * len(envs), noise, seeds_of)])
 
 
 def at_once(work: Callable[..., Result], *arguments: Sequence[Any]) -> list[Result]:
@@ -428,15 +428,15 @@ def against_mean(rollout: Rollout) -> Rollout:
     """A rollout of pairs, experiment i and i + N/2, with rewards less their pair's mean.
 
     A pair of which one leaves the limits does not end together. There, the first experiments are compared by their
-    returns, each in its last step. One that left the limits gets the least, and what follows counts for nothing.
+    returns, each in its last step. One that violated them gets the least, and the steps after it count for nothing.
     """
     apart = _less_mean(rollout.rewards)
     first = rollout.terminals.cumsum(0) - rollout.terminals == 0.0
-    left = (rollout.strayed.bool() & first).any(0)
-    returns = torch.where(first, rollout.rewards, 0.0).sum(0).masked_fill(left, -math.inf)
-    paid = torch.where(left, -FARTHEST, _less_mean(returns[None])[0])
+    violated = (rollout.strayed.bool() & first).any(0)
+    returns = torch.where(first, rollout.rewards, 0.0).sum(0).masked_fill(violated, -math.inf)
+    paid = torch.where(violated, -FARTHEST, _less_mean(returns[None])[0])
     ends = torch.zeros_like(apart)
-    ends[first.sum(0) - 1, torch.arange(len(left))] = paid
+    ends[first.sum(0) - 1, torch.arange(len(violated))] = paid
     one, other = rollout.strayed.any(0).chunk(2)
     return replace(rollout, rewards=torch.where(torch.cat(2 * [one | other]), ends, apart))
 
@@ -485,17 +485,17 @@ def collect(env: EmbExcitationVectorEnv, actor: Actor, noise: Tensor, seeds: Seq
             strayed[t], homes[t] = (torch.from_numpy(over & final[name]) for name in ("violated", "home"))
     states[steps] = torch.from_numpy(info["critic"])
     ended = int(terminals.sum())
-    whole = ended and steps >= env.batch.bench.timing.horizon
-    mean_return = float(rewards.sum()) / (ended if whole else env.num_envs + int(terminals[:-1].sum()))
+    complete = ended and steps >= env.batch.bench.timing.horizon
+    mean_return = float(rewards.sum()) / (ended if complete else env.num_envs + int(terminals[:-1].sum()))
     return Rollout(seen, states, actions, log_densities, rewards, terminals, strayed, homes, mean_return)
 
 
 def exploration_noise(steps: int, envs: int, noise_memory: float, generator: torch.Generator, hold: int = 1) -> Tensor:
     """Gaussian noise with standard deviation 1 at every step and correlation ``noise_memory`` from step to step.
 
-    White noise at 1 kHz averages out before the brake notices. Each step's own density is unchanged, and the policy's
+    White noise at 1 kHz averages out before the brake notices. The density of each step is unchanged, and the policy's
     gradient estimated with it is the true one of the smoothed objective times the noise's covariance over time: an
-    ascent direction that moves neighbouring steps together. Each value is held for ``hold`` steps.
+    ascent direction that moves neighbouring steps together. Each value stays for ``hold`` steps.
 
     Returns:
         Shape [steps, envs, 1].
@@ -519,7 +519,7 @@ def improve(
     phase = int(torch.randint(ppo.noise_hold, (), generator=generator)) if ppo.noise_hold > 1 else 0
 
     def thinned(of_steps: Tensor) -> Tensor:
-        """One step of each that the noise was held for, those of all experiments one after the other."""
+        """One step of each value of the noise, those of all experiments one after the other."""
         return of_steps[phase :: ppo.noise_hold].flatten(0, 1)
 
     seen, actions, states = thinned(rollout.seen), thinned(rollout.actions), thinned(rollout.states[:-1])

@@ -1,7 +1,7 @@
 """Presets by name, with a line on each for ``--help``: read without torch.
 
 They are the trainings of ``emb-train ppo``, in ``presets.toml``: ``thesis-…`` under the thesis's conditions and with
-its hyper-parameters, the others the project's own.
+its hyper-parameters, the others with those of this project.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def preset_summaries() -> dict[str, str]:
 
 
 def preset_record(name: str) -> dict[str, Any]:
-    """The table of a preset, with its hyper-parameters; the caller's own.
+    """The table of a preset, with its hyper-parameters, as a copy.
 
     Raises:
         UsageError: there is no such preset.

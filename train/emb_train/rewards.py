@@ -1,9 +1,9 @@
-"""Rewards: what a step, or a whole experiment, is worth.
+"""Rewards of a step, or of an experiment at its end.
 
 The rewards of a step are small named functions of what it did to the brake and to its Fisher information: each takes a
 :class:`Transition` of N brakes and returns N numbers. Those of the thesis read the weighted FIM (outputs divided by
 100 rad and 500 rad/s, eq. 4.21). The constants below are those of eq. 5.14 and 5.15; where the thesis prints none for
-another reward, the same ones hold. Those of a whole experiment, at the end, look at the experiments of a batch.
+another reward, the same ones hold. Those at the end look at the experiments of a batch.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ EPSILON = 1e-6  # ε of M₀ = ε I (eq. 4.28); the thesis calls it small
 ALPHA = 1e4  # α of eq. 6.4 and 6.5
 PRIOR = 12.0  # Information of a prior of ±50 %: one over the variance of a uniform distribution from 0.5 to 1.5
 UNKNOWN = 1e9  # Times a deviation is too large before the first sample
-SHORTEST = 20  # Samples of a record below which nothing counts as known
+SHORTEST = 20  # Samples of a record below which nothing counts as estimated
 
 
 class Turn(NamedTuple):
@@ -55,7 +55,7 @@ class Transition(NamedTuple):
     after: Floats  # Packed FIM after the step, same shape
     x: Floats  # True angle [rad] and velocity [rad/s] after the step, shape [N, 2]
     step: NDArray[np.int64]  # Steps made, this one included, shape [N]: k of r_k
-    violated: NDArray[np.bool_]  # True where the limits have been left, shape [N]
+    violated: NDArray[np.bool_]  # True where the limits are violated, shape [N]
     turn: Turn
     horizon: int  # Steps in one experiment, T
     sample_time: float  # [s]
@@ -89,7 +89,7 @@ def information_increment(t: Transition) -> Floats:
 
 
 def penalised_increment(t: Transition) -> Floats:
-    """The increment less 200 (x₁ − 75)² [x₁ > 75], and −4·10⁴ where the limits are left (eq. 5.14)."""
+    """The increment less 200 (x₁ − 75)² [x₁ > 75], and −4·10⁴ where the limits are violated (eq. 5.14)."""
     return np.where(t.violated, -UNSAFE, information_increment(t) - risk(t))
 
 
@@ -97,7 +97,7 @@ def adaptive_return(t: Transition) -> Floats:
     """Information first, then more and more the way home (eq. 5.15, all five branches in one line).
 
     r_k = (1 − q) ΔM_k − 200 (x₁ − 75)² [x₁ > 75] − 0.1 q ((10 x₁)² + x₂²), with q = (k/T)² after 300 steps and 0
-    before; and −10⁷ where the limits are left.
+    before; and −10⁷ where the limits are violated.
     """
     x1, x2 = t.x[:, 0], t.x[:, 1]
     q = np.where(t.step > OUTWARD, (t.step / t.horizon) ** 2, 0.0)
@@ -142,7 +142,7 @@ def squared_determinant_gain(t: Transition) -> Floats:
 
 
 def log_determinant(t: Transition) -> Floats:
-    """Increment of ln |M + 12 I| (D, eq. 4.12-4.13): what is known beforehand within ±50 % earns nothing."""
+    """Increment of ln |M + 12 I| (D, eq. 4.12-4.13): what the prior of ±50 % tells earns nothing."""
     return gain(LOG_DET, t, PRIOR)
 
 
@@ -206,7 +206,7 @@ def quintic(
 
 
 def _explored(t: Transition, back: Floats) -> Floats:
-    """The exploration's reward until step 300, ``back`` after it, and −10⁷ where the limits are left; shape [N]."""
+    """The exploration's reward until step 300, ``back`` after it, and −10⁷ where the limits are violated; shape [N]."""
     out = gain(LAMBDA_MIN, t, 0.0) - risk(t)
     return np.where(t.violated, -UNSAFE_RETURN, np.where(t.step > OUTWARD, back, out))
 
@@ -218,7 +218,7 @@ class Demands(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     release. And the motion is to show that a node lies (:mod:`emb_train.lies`).
     """
 
-    astray: Price = 20.0  # Price of limits left, or of an end away from home [nat]
+    astray: Price = 20.0  # Price of violated limits, or of an end away from home [nat]
     release: Share = 0.3  # Part of the way to the lowest angle that is free
     beyond: Price = 1.0  # Price of each radian beyond it [nat]
     shown: Price = 1.15  # How clearly the motion shows each lie; above 1 a run is ended
@@ -230,7 +230,7 @@ DEMANDS = Demands()
 
 @dataclass(frozen=True)
 class ExpectedInterval:
-    """Reward of a whole experiment, in its last step [nat]: the criterion of the interval that an estimate will have.
+    """Reward of an experiment, in its last step [nat]: the criterion of the interval that an estimate will have.
 
     Without a discount it is the sum of the criterion's increments. What the experiment pays is taken off.
     """
@@ -260,7 +260,7 @@ class Precision(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     """Precision to be reached, as relative standard deviations; 95 % of the estimates are within twice that."""
 
     repeatability: Positive = 0.0065  # Of the running estimates, which ends an experiment
-    interval: Positive = 0.0025  # Between runs, of the whole record
+    interval: Positive = 0.0025  # Between runs, of the complete record
     price: Price = 10.0  # Of an interval that is e times as wide [periods]
 
 
@@ -268,11 +268,11 @@ PRECISION = Precision()
 
 
 class TimeToPrecision:
-    """Reward of a step: minus the share of the period in which a running estimate was less precise than asked for.
+    """Reward of a step: minus the share of the period in which a running estimate was not precise enough.
 
-    So the return is minus the number of periods until all four are known. The experiment has ended then, and its way
-    home begins, as in the runtime. What the interval of the whole record is wider than asked for is taken off: when it
-    has ended for the record so far, and what is won on the way is given back at the first sample at home.
+    So the return is minus the number of periods until all four are precise. The experiment has ended then, and its way
+    home begins, as in the runtime. An interval of the record that is wider than required has a price: it is paid at
+    this end, for the record so far, and what the way home improves is paid back at the first sample at home.
     """
 
     def __init__(self, precision: Precision = PRECISION, pool: Executor | None = None) -> None:
@@ -281,7 +281,7 @@ class TimeToPrecision:
         self._missing, self._price = np.zeros(1), np.zeros(1)
 
     def __call__(self, batch: Batch) -> Floats:
-        """Rewards of the newest step of N experiments, shape [N]; the way home begins for those that are known."""
+        """Rewards of the newest step of N experiments, shape [N]; the way home begins for those that are precise."""
         returning, begun = batch.experiments.returning, batch.experiments.k == 1
         before, price = np.where(begun, UNKNOWN, self._missing), np.where(begun, 0.0, self._price)
         self._missing, self._price = np.minimum(before, self._ratio(batch)), price
@@ -298,9 +298,9 @@ class TimeToPrecision:
         return rewards
 
     def _ratio(self, batch: Batch) -> Floats:
-        """Greatest ratio of a relative deviation to the one asked for, shape [N]."""
-        told, asked = batch.estimate(), self._precision.repeatability
-        ratio: Floats = np.minimum((told[:, 4:] / (asked * told[:, :4])).max(axis=1), UNKNOWN)
+        """Greatest ratio of a relative deviation to the required one, shape [N]."""
+        estimates, required = batch.estimate(), self._precision.repeatability
+        ratio: Floats = np.minimum((estimates[:, 4:] / (required * estimates[:, :4])).max(axis=1), UNKNOWN)
         return ratio
 
     def _price_of(self, batch: Batch, rows: Bools) -> Floats:

@@ -62,7 +62,7 @@ VALIDATION_STREAM = 0x6578616D  # Spawn key of the seeds of the validation; thos
 
 
 class Plan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A plan as it is kept."""
+    """A plan as it is stored."""
 
     speeds: Annotated[tuple[Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)], ...], msgspec.Meta(min_length=1)]
     """Parts of the limit, one for each step."""
@@ -136,9 +136,9 @@ def training_from(record: object, source: str) -> Training:
         UsageError: a key is unknown or missing, or a value is of another type or impossible.
     """
     training = read(Training, record, source, UsageError)
-    known = (*REWARDS, *NUMBERS, TIME)
-    if training.reward not in known:
-        raise UsageError(f"{source}: reward: expected one of {', '.join(known)}, got '{training.reward}'")
+    rewards = (*REWARDS, *NUMBERS, TIME)
+    if training.reward not in rewards:
+        raise UsageError(f"{source}: reward: expected one of {', '.join(rewards)}, got '{training.reward}'")
     if training.reward == TIME and not training.conditions.estimates:
         raise UsageError(f'{source}: reward: a time needs the conditions acts = "speed", observes = "estimate"')
     if (training.conditions.acts == "speed") != (training.conditions.observes == "estimate"):
@@ -253,7 +253,7 @@ def follow_plan(
     folder: Path,
     actor: Actor,
     training: Training,
-    asked: PlanSearch,
+    options: PlanSearch,
     bench: Bench,
     pool: Executor | None,
     show: Show,
@@ -273,16 +273,16 @@ def follow_plan(
         numbers = np.clip(found[0].numbers, -1.0, 1.0)
         speeds = speeds_of(numbers, training.ppo.rollout)
         plan = np.pad(speeds, (0, max(bench.timing.horizon - len(speeds), 0)), "edge").tolist()
-        kept = Plan(tuple(plan), training.ranges, training.conditions.gain)
-        (folder / PLAN).write_text(json_document(msgspec.to_builtins(kept)) + "\n", encoding="utf-8")
+        stored = Plan(tuple(plan), training.ranges, training.conditions.gain)
+        (folder / PLAN).write_text(json_document(msgspec.to_builtins(stored)) + "\n", encoding="utf-8")
         show(None)
         clone(actor, plan, bench, training.ppo, torch.Generator().manual_seed(training.seed))
 
-    environments = training.environments(bench, asked.population * asked.brakes, pool)
+    environments = training.environments(bench, options.population * options.brakes, pool)
     compared = Compared(environments, training.ppo.rollout, training.seed)
     rng = np.random.default_rng(np.random.SeedSequence(training.seed, spawn_key=(PLAN_STREAM,)))
     try:
-        search(compared, asked, rng, show=searched)
+        search(compared, options, rng, show=searched)
         follow()
     except KeyboardInterrupt:
         if not found:
@@ -303,7 +303,7 @@ class Validation:
         self._seeds = stream.generate_state(each, np.uint64).tolist()
 
     def score(self, actor: Actor) -> float:
-        """Mean return of an experiment without exploration, in the training's own reward."""
+        """Mean return of an experiment without exploration, in the reward of the training."""
         steps, count = self._envs[0].batch.bench.timing.horizon, len(self._seeds)
         each = len(self._envs)
         noise = [torch.zeros(steps, count, 1)] * each
@@ -336,12 +336,12 @@ def begin_training(folder: Path, training: Training, bench: Bench) -> None:
     """
     training.environments(bench, 1)
     rollout, horizon = training.ppo.rollout, training.conditions.applied(bench).timing.horizon
-    timed = training.reward == TIME  # what comes after the estimates are known does not count
+    timed = training.reward == TIME  # the steps after the estimates do not count
     if rollout > horizon and (training.plan is not None or timed):
         raise UsageError(f"rollout: expected at most the bench's horizon of {horizon} steps, got {rollout}")
     if not timed and (rollout < horizon or (training.conditions.shielded and rollout % horizon)):
         raise UsageError(  # else experiments end at any step
-            f"expected a rollout of whole experiments, got {rollout} steps for the bench's horizon of {horizon}: "
+            f"expected a rollout of complete experiments, got {rollout} steps for the bench's horizon of {horizon}: "
             "use a bench file whose horizon divides it"
         )
     make_empty_folder(folder)
