@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
+import pickle
 import subprocess
 import sys
 from collections.abc import Callable
@@ -241,6 +243,7 @@ def test_calls_that_do_not_fit_the_experiments_are_refused() -> None:
         lambda: one.reset(options={"brake": BENCH.brake}),
         lambda: many.reset(options={"brakes": [BENCH.brake]}),
         lambda: many.reset(options={"brakes": [BENCH.brake, tuple(BENCH.brake)]}),
+        lambda: many.reset(options={"brakes": [BENCH.brake, BENCH.brake._replace(T_c=1e300)]}),
         lambda: many.reset(seed=[1, 2, 3]),
     ]
     for call in calls:
@@ -255,6 +258,20 @@ def test_calls_that_do_not_fit_the_experiments_are_refused() -> None:
         one.step(np.zeros(1, np.float32))
     with pytest.raises(UsageError):
         one.step(np.zeros(1, np.float32))  # beyond the horizon
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_of_an_environment_goes_on_as_the_original_does(copied: Callable[[Any], Any]) -> None:
+    for env in (EmbExcitationEnv(bench=SHORT, conditions=FOLLOWED), EmbExcitationVectorEnv(2, SHORT)):
+        env.reset(seed=3)
+        for k, action in enumerate(actions(4, 90)):
+            if k == 60 and isinstance(env, EmbExcitationEnv):
+                break  # the other one begins again by itself
+            if k == 20:
+                other = copied(env)
+            made = env.step(np.full(env.action_space.shape, action))
+            if k >= 20:
+                np.testing.assert_equal(other.step(np.full(env.action_space.shape, action)), made)
 
 
 def test_without_a_shield_an_action_is_clipped_and_leaving_the_limits_ends_the_experiment_with_the_penalty() -> None:

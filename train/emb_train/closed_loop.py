@@ -438,6 +438,17 @@ class Batch:
         code: Callable[[Setup, Experiments, Floats], None] = step.compile(tuple(types))
         return code
 
+    def __getstate__(self) -> dict[str, Any]:
+        """The state of a copy: without the machine code of a step, the loops in a plain list."""
+        state = {name: value for name, value in vars(self).items() if name != "_step"}
+        return state | {"experiments": self.experiments._replace(loops=list(self.experiments.loops))}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        loops = compiled(first_loops)(state["setup"], len(state["experiments"].loops))
+        for i, loop in enumerate(state["experiments"].loops):
+            loops[i] = loop
+        vars(self).update(state | {"experiments": state["experiments"]._replace(loops=loops)})
+
     def newest(self, series: Floats) -> Floats:
         """Items of a series for the newest sample of each experiment, shape [N, ...]; a copy."""
         newest: Floats = series[np.arange(len(series)), self.experiments.k]

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.information.symmetric import Floats
+from emb_bench.sim.simulated_brake import check_near_nominal
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
 from emb_train import register_environments
@@ -102,7 +103,8 @@ class EmbExcitationVectorEnv(gymnasium.vector.VectorEnv[Observations, Observatio
             options: ``{"brakes": [BrakeParameters, ...]}`` chooses the N brakes.
 
         Raises:
-            UsageError: the number of seeds or brakes is not N, one of the brakes is none, or there is another option.
+            UsageError: the number of seeds or brakes is not N, one of the brakes is none, or farther from the
+                nominal one than a factor of 100, or there is another option.
         """
         if seed is not None or not self._generators:
             self._generators = [seeding.np_random(s)[0] for s in self._seeds(seed)]
@@ -156,6 +158,8 @@ class EmbExcitationVectorEnv(gymnasium.vector.VectorEnv[Observations, Observatio
         brakes = options.get("brakes")
         listed = set(options) == {"brakes"} and isinstance(brakes, list) and len(brakes) == self.num_envs
         if listed and brakes is not None and all(isinstance(brake, BrakeParameters) for brake in brakes):
+            for name, value in (item for brake in brakes for item in brake._asdict().items()):
+                check_near_nominal(self.batch.bench, name, value, "reset: brakes: ")
             return list(brakes)
         raise UsageError(f"reset: expected the option 'brakes' with {self.num_envs} BrakeParameters, got {options!r}")
 
