@@ -13,9 +13,8 @@ import tomlkit
 from tomlkit import TOMLDocument
 
 from emb_bench.brake.parameters import SI
-from emb_bench.commission.comparison import contradiction, not_inside, sheet_range
 from emb_bench.commission.examination import MARGIN
-from emb_bench.commission.records import Findings, Identification, Velocity
+from emb_bench.commission.records import Findings, Identification, Velocity, sheet_range
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.config.plants import FASTEST_LOOP, SHORTEST_LAG
 from emb_runtime.config.bench import PARAMETER_NAMES
@@ -65,8 +64,8 @@ def found_text(sheet: Bench, found: Findings, logs: str) -> str:
         BenchFileError: an interval is not inside of the data sheet's range, or no shield covers the ranges.
     """
     current, one = found.current, found.identified
-    if names := not_inside(sheet, one):
-        raise BenchFileError(contradiction(sheet, one, names))
+    if names := one.not_inside(sheet):
+        raise BenchFileError(one.contradiction(sheet, names))
     document, by_fit = _draft(sheet), f"model {one.model}, {logs}"
     for name in PARAMETER_NAMES:
         low, high, reason = measured_range(sheet, one, name)
@@ -133,7 +132,7 @@ def _secants(sheet: Bench, one: Identification) -> tuple[float, float]:
 
 
 def _rounded(value: float, *, up: bool = False) -> float:
-    """To five digits, down or up, so that a range holds what it held."""
+    """To five digits, down or up, so that a range stays at least as wide."""
     if value == 0.0 or not math.isfinite(value):
         return value
     scale = 10.0 ** (4 - math.floor(math.log10(abs(value))))
@@ -144,7 +143,7 @@ def _rounded(value: float, *, up: bool = False) -> float:
 
 
 def _draft(sheet: Bench) -> TOMLDocument:
-    """The data sheet's document with its ranges as one whole set."""
+    """The data sheet's document with its ranges as one complete set."""
     document = parse_toml(sheet.text, sheet.name, BenchFileError)
     document["ranges"] = {SHEET: {name: list(sheet_range(sheet, name)) for name in PARAMETER_NAMES}}
     document["shield"] = {**document["shield"], "ranges": SHEET}
@@ -178,8 +177,8 @@ def _text(document: TOMLDocument) -> str:
     Raises:
         BenchFileError: there is none.
     """
-    low, own = document.unwrap()["limits"]["angle"]
-    highest, refusal = own, None
+    low, high = document.unwrap()["limits"]["angle"]
+    highest, refusal = high, None
     while True:
         try:
             make_law(parse_bench(tomlkit.dumps(document), "the bench of a commissioning"))
@@ -188,7 +187,7 @@ def _text(document: TOMLDocument) -> str:
             highest -= STEP_DOWN
             if not highest >= NARROWEST:
                 raise refusal from None
-            origin = f"{own:g} rad by the data sheet; the largest for which a shield covers the ranges"
+            origin = f"{high:g} rad by the data sheet; the largest for which a shield covers the ranges"
             _put(document, "limits.angle", [low, highest], origin)
         else:
             return f"{HEAD}\n{tomlkit.dumps(document)}"

@@ -8,16 +8,16 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from emb_bench.brake.parameters import SI
-from emb_bench.commission import comparison, examination, steps
+from emb_bench.commission import examination, steps
 from emb_bench.commission.bench_file import WRITTEN, found_text, working_text
-from emb_bench.commission.records import Findings, Identification
-from emb_bench.commission.steps import EXPERIMENTS, Step, policy_file
+from emb_bench.commission.records import Findings, Identification, noise_problems, sheet_range, suspected
+from emb_bench.commission.steps import EXPERIMENTS, FULL, Step, step_policy
 from emb_bench.config.bench import Bench, load_bench, parse_bench
 from emb_bench.logs.log import RunLog
 from emb_runtime.can.messages import bench_identity
@@ -29,7 +29,7 @@ from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system import terminal
 
 WORKING, FASTER, FOUND = "working.toml", "working-2.toml", "bench.toml"
-"""Names of the bench files in the folder: up to the free stroke, once the velocity is known, and in the end."""
+"""Names of the bench files in the folder: up to the free stroke, with the velocity found there, and in the end."""
 RECENT = 2  # Experiments that the parameters are estimated from: each is larger and tells more than those before it
 OUTSIDE = {Fault.OUT_OF_LIMITS.name, Fault.MOTION_OUTSIDE_SET.name}
 """Results by which the brake may lie outside of the data sheet's ranges."""
@@ -37,7 +37,6 @@ SIMULATED = ("sim", "sim-drive")  # Buses whose brake is made anew for each run
 
 Run = Callable[[Sequence[str]], Mapping[str, Any]]
 """A run of ``emb-run --json`` with these arguments; the document that it prints."""
-Finding = TypeVar("Finding")
 
 
 class StepFailedError(EmbError):
@@ -67,26 +66,23 @@ class Commissioned:
         return "\n".join([*lines, f"  bench file {self.bench}: a comment behind each measured number gives its source"])
 
 
+@dataclass
 class Commissioning:
-    """Commissioning in a folder.
+    """Commissioning in a folder."""
 
-    Args:
-        folder: for bench files, policies and logs; a step that has a completed log there is not run again.
-        sheet: bench file with the data sheet's ranges.
-        iface: the bus.
-        options: further options of ``emb-run`` for each run.
-        run: makes a run.
-        say: reports progress.
-    """
+    folder: Path
+    """For bench files, policies and logs; a step that has a completed log there is not run again."""
+    sheet: Bench  # With the data sheet's ranges
+    iface: str  # The bus
+    options: Sequence[str]  # Further ones of ``emb-run`` for each run
+    make_run: Run
+    say: Callable[[str], None]  # Reports progress
 
-    def __init__(
-        self, folder: Path, sheet: Bench, iface: str, options: Sequence[str], run: Run, say: Callable[[str], None]
-    ) -> None:
-        self._folder, self._sheet, self._iface, self._options = folder, sheet, iface, options
-        self._make_run, self._say = run, say
-        self._logs: list[RunLog] = []
+    def __post_init__(self) -> None:
+        self._bench, self._path = self.sheet, Path()  # bench file of the next run
+        self._identity = self.sheet.identity_hash  # of the bench that the node is set up for
+        self._logs = list[RunLog]()
         self._identified: Identification | None = None
-        self._identity = sheet.identity_hash  # of the bench that the node is set up for
         self._runs = 0
 
     def run(self) -> Commissioned:
@@ -98,94 +94,93 @@ class Commissioning:
             SafetyStopError: a step contradicts the data sheet.
             BenchFileError: no shield covers the data sheet, or a parameter lies outside of it.
         """
-        sheet, working = self._sheet, self._bench_file(WORKING, working_text(self._sheet))
-        work = load_bench(working)
-        noise = examination.noise_at_rest(self._log("1-listen", steps.LISTEN, working), sheet)
-        self._say(f"  found: noise {plain(noise.angle)} rad and {plain(noise.velocity)} rad/s")
-        comparison.check_noise(noise, sheet)
-        self._log("2-zero", steps.ZERO, working)
-        self._say("  found: no fault")
-        current = self._found(examination.current(self._log("3-current", steps.current_check(work), working)))
-        comparison.check_current(current, sheet)
-        log = self._log("4-first-move", steps.first_move(work), working)
-        move = self._found(examination.first_move(log, noise))
-        comparison.check_first_move(move, sheet)
+        sheet = self.sheet
+        self._use(WORKING, working_text(sheet))
+        noise = examination.noise_at_rest(self._log("1-listen", steps.LISTEN), sheet)
+        words = f"noise {plain(noise.angle)} rad and {plain(noise.velocity)} rad/s"
+        self._found(words, noise_problems(noise, sheet))
+        self._log("2-zero", steps.ZERO)
+        self._found("no fault", ())
+        current = examination.current(self._log("3-current", steps.current_check(self._bench)))
+        self._found(current, current.problems(sheet))
+        move = examination.first_move(self._log("4-first-move", steps.first_move(self._bench)), noise)
+        self._found(move, move.problems(sheet))
         for name, row in EXPERIMENTS.items():
-            self._log(name, steps.experiment(row, work, move), working)
-            recent, before = self._logs[4:][-RECENT:], self._identified
-            one = self._found(examination.identify(recent, sheet, noise, before))
-            comparison.check_velocity(one.velocity, work.sensors)
-            known = one.velocity.sensors
-            if before is None and (known.bandwidth or math.inf) > (work.sensors.bandwidth or math.inf):
-                working = self._bench_file(FASTER, working_text(sheet, one.velocity))
-                work = load_bench(working)
-            comparison.check_experiment(one, sheet, is_first=before is None)
+            self._log(name, steps.experiment(row, self._bench, move))
+            recent, before, declared = self._logs[4:][-RECENT:], self._identified, self._bench.sensors
+            one = examination.identify(recent, sheet, noise, before)
+            self._found(one, one.velocity.problems(declared))
+            if before is None and (one.velocity.sensors.bandwidth or math.inf) > (declared.bandwidth or math.inf):
+                self._use(FASTER, working_text(sheet, one.velocity))
+            _require_none(one.problems(sheet, is_first=before is None))
             self._identified = one
         found = Findings(noise, current, move, one)
-        path = self._bench_file(FOUND, found_text(sheet, found, " and ".join(log.path.name for log in recent)))
-        bench = load_bench(path)
-        log = self._log("9-full", steps.experiment(steps.FULL, bench, move), path)
-        comparison.check_last(self._found(examination.identify([log], sheet, noise, one)), bench)
-        ranges = {name: comparison.sheet_range(bench, name) for name in PARAMETER_NAMES}
-        return Commissioned(path, ranges, found, tuple(log.path for log in self._logs), self._runs)
+        self._use(FOUND, found_text(sheet, found, " and ".join(log.path.name for log in recent)))
+        last = examination.identify([self._log("9-full", steps.experiment(FULL, self._bench, move))], sheet, noise, one)
+        self._found(last, last.changes(self._bench))
+        ranges = {name: sheet_range(self._bench, name) for name in PARAMETER_NAMES}
+        return Commissioned(self._path, ranges, found, tuple(log.path for log in self._logs), self._runs)
 
-    def _found(self, finding: Finding) -> Finding:
-        self._say(f"  found: {finding}")
-        return finding
+    def _found(self, finding: object, problems: Iterable[EmbError]) -> None:
+        self.say(f"  found: {finding}")
+        _require_none(problems)
 
-    def _bench_file(self, name: str, text: str) -> Path:
-        """Write a bench file, unless logs rest on another bench of that name, or somebody else wrote it."""
-        path = self._folder / name
+    def _use(self, name: str, text: str) -> None:
+        """Write a bench file for the next runs, unless logs rest on another of that name, or somebody else wrote it."""
+        self._path, self._bench = path, bench = self.folder / name, parse_bench(text, name)
         if path.exists():
             there = load_bench(path)
             if there.text == text:
-                return path  # a full disk would empty it
-            is_another = there.identity_hash != parse_bench(text, name).identity_hash
-            if is_another and (any(self._folder.glob("*.mcap")) or WRITTEN not in there.text):
+                return  # a full disk would empty it
+            is_another = there.identity_hash != bench.identity_hash
+            if is_another and (any(self.folder.glob("*.mcap")) or WRITTEN not in there.text):
                 raise UsageError(
                     f"{path}: another bench than this data sheet's or these logs', which rest on it; go on with the "
                     "data sheet that it was made from, or take another folder for this one"
                 )
         path.write_text(text, encoding="utf-8")
-        write_schemas(self._folder, "bench")
-        return path
+        write_schemas(self.folder, "bench")
 
-    def _log(self, name: str, step: Step, path: Path) -> RunLog:
-        """The completed log of a step with a bench file: one that is there, else that of a new run."""
-        file, attempts, log = self._folder / f"{name}.mcap", 1, None
+    def _log(self, name: str, step: Step) -> RunLog:
+        """The completed log of a step: one that is there, else that of a new run."""
+        file, attempts, log = self.folder / f"{name}.mcap", 1, None
         while file.exists() and (log := examination.completed(file)) is None:
             attempts += 1
-            file = self._folder / f"{name}-attempt{attempts}.mcap"
+            file = self.folder / f"{name}-attempt{attempts}.mcap"
         if log is None:
-            log = self._run(name, step, path, file)
+            log = self._run(name, step, file)
         self._logs.append(log)
         return log
 
-    def _run(self, name: str, step: Step, path: Path, log: Path) -> RunLog:
-        self._say(f"{name}: {step.purpose}")
-        bench = load_bench(path)
-        if bench.identity_hash != self._identity:
-            self._identity = bench.identity_hash
-            self._say(f"  set up the node for {path}, bench identity {bench_identity(bench.identity_hash):#06x}")
-        policy = self._folder / f"{name}.onnx"
-        policy.write_bytes(policy_file(step, bench))
-        arguments = ["--iface", simulated(self._iface, self._sheet, self._runs), "--bench", str(path)]
+    def _run(self, name: str, step: Step, log: Path) -> RunLog:
+        self.say(f"{name}: {step.purpose}")
+        if self._bench.identity_hash != self._identity:
+            self._identity = self._bench.identity_hash
+            self.say(f"  set up the node for {self._path}, bench identity {bench_identity(self._identity):#06x}")
+        policy = self.folder / f"{name}.onnx"
+        policy.write_bytes(step_policy(step, self._bench))
+        arguments = ["--iface", simulated(self.iface, self.sheet, self._runs), "--bench", str(self._path)]
         arguments += ["--policy", str(policy), "--log", str(log), "--duration", repr(step.duration)]
         self._runs += 1
-        document = self._make_run([*arguments, *self._options, *step.stage, "--json"])
+        document = self.make_run([*arguments, *self.options, *step.stage, "--json"])
         if document["exit_code"] == EXIT_DONE and (completed := examination.completed(log)) is not None:
             return completed
         why, is_outside = _failure(document)
         advice = f"see {log}, and begin again in the same folder once the cause is removed"
         if is_outside:  # no brake of the set moves so
-            advice = comparison.suspected(self._sheet, self._identified)
+            advice = suspected(self.sheet, self._identified)
         raise StepFailedError(
             f"step {name} was not completed: {why}; {advice}", document["exit_code"] or EXIT_SAFETY_STOP
         )
 
 
+def _require_none(problems: Iterable[EmbError]) -> None:
+    for problem in problems:
+        raise problem
+
+
 def emb_run(arguments: Sequence[str]) -> Mapping[str, Any]:
-    """Run ``emb-run`` as a process of its own, at the operator's terminal; signals that end this one end that one."""
+    """Run ``emb-run`` in another process, at the operator's terminal; signals that end this process end that one."""
     code = "import sys; from emb_runtime.system.entry import emb_run; sys.exit(emb_run())"
     process = subprocess.Popen([sys.executable, "-P", "-c", code, *arguments], stdout=subprocess.PIPE, text=True)
     ended: list[int] = []
@@ -212,7 +207,7 @@ def emb_run(arguments: Sequence[str]) -> Mapping[str, Any]:
 
 
 def simulated(iface: str, sheet: Bench, run: int) -> str:
-    """A simulated brake that stays the same when the bench file changes, with noise of its own in each run.
+    """A simulated brake that stays the same when the bench file changes, with other noise in each run.
 
     Any other bus stays as it is.
     """
@@ -220,9 +215,10 @@ def simulated(iface: str, sheet: Bench, run: int) -> str:
     name, _, given = bus.partition(":")
     if name not in SIMULATED:
         return iface
-    own = {parameter: getattr(sheet.brake, parameter) for parameter in PARAMETER_NAMES}
-    own |= {"angle_noise": sheet.noise.angle, "velocity_noise": sheet.noise.velocity, "seed": 1}
-    options = ",".join([given, *(f"{key}={own[key]!r}" for key in own if not re.search(rf"\b{key} *=", given))])
+    nominal = {parameter: getattr(sheet.brake, parameter) for parameter in PARAMETER_NAMES}
+    nominal |= {"angle_noise": sheet.noise.angle, "velocity_noise": sheet.noise.velocity, "seed": 1}
+    missing = (f"{key}={value!r}" for key, value in nominal.items() if not re.search(rf"\b{key} *=", given))
+    options = ",".join([given, *missing])
     seeded = re.sub(r"\bseed *= *(\d+)", lambda seed: f"seed={int(seed[1]) + run}", options)
     return f"{head}{at}{name}:{seeded.lstrip(',')}"
 

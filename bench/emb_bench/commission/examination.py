@@ -33,7 +33,7 @@ from emb_runtime.drives.mapping import Mapping as DriveMapping
 from emb_runtime.errors import LogError
 
 LONGEST = 2  # Samples by which measurements may come late, at most, that are looked for
-FEWEST = 300  # Samples at rest, at least, that a noise is known by
+FEWEST = 300  # Least number of samples at rest for an estimate of the noise
 STARTS = 3  # Local searches of a model
 MOVING = 6.0  # Standard deviations of the velocity from which on the brake moves
 SMOOTHED = 10  # Samples of a mean in which a motion shows, and noise counts a third
@@ -45,14 +45,14 @@ UNIFORM = math.sqrt(1.0 / 12.0)  # Standard deviation of an error that may be an
 
 
 def completed(path: Path) -> RunLog | None:
-    """The log of a run that came to its planned end, whole, and with samples enough at rest if it listened; or None."""
+    """The complete log of a run that came to its planned end, and that has samples enough if it listened; or None."""
     try:
         log = read_log(path)
     except LogError:
         return None
-    heard = json.loads(log.end.get("heard", "null"))
-    is_whole = log.complete and log.exit_reason == "DONE"
-    return log if is_whole and (heard is None or heard.get("scatter", {}).get("pairs", 0) >= FEWEST) else None
+    listened = json.loads(log.end.get("heard", "null"))
+    is_done = log.complete and log.exit_reason == "DONE"
+    return log if is_done and (listened is None or listened.get("scatter", {}).get("pairs", 0) >= FEWEST) else None
 
 
 def noise_at_rest(log: RunLog, sheet: Bench) -> Noise:
@@ -70,7 +70,7 @@ def noise_at_rest(log: RunLog, sheet: Bench) -> Noise:
 
 
 def _steps(drive: DriveMapping | None) -> tuple[float, float]:
-    """Steps of a mapped drive's angle [rad] and velocity [rad/s]; none of our own node's."""
+    """Steps of a mapped drive's angle [rad] and velocity [rad/s]; none of our node's."""
     return (0.0, 0.0) if drive is None else (step_of(drive.angle), step_of(drive.velocity))
 
 
@@ -111,8 +111,8 @@ def first_move(log: RunLog, noise: Noise) -> FirstMove:
     return FirstMove(_first(np.abs(before), up), _first(np.abs(before), down), scale)
 
 
-def _first(currents: Floats, chosen: Booleans) -> float:
-    at = np.flatnonzero(chosen)
+def _first(currents: Floats, mask: Booleans) -> float:
+    at = np.flatnonzero(mask)
     return float(currents[at[0]]) if len(at) else math.nan
 
 
@@ -129,27 +129,25 @@ def identify(logs: Sequence[RunLog], sheet: Bench, noise: Noise, before: Identif
     velocity = velocity_of(experiments, sheet.timing.sample_time)
     bench = replace(sheet, noise=noise_in_motion(noise, logs[0].drive), sensors=velocity.sensors)
     best = _best(bench, experiments, before, velocity.bandwidth)
-    asked = with_systematic(best.question, bench, best.plant)
-    e = fit_from(Problem(bench, best.plant, asked, best.experiments), best).finished() if asked.systematic else best
+    problem = with_systematic(best.question, bench, best.plant)
+    e = fit_from(Problem(bench, best.plant, problem, best.experiments), best).finished() if problem.systematic else best
     names = [unknown.name for unknown in e.unknowns]
     half = NORMAL_95 * e.between_runs() * e.scale
-    values = dict(zip(names, e.values.tolist(), strict=True))
-    lows = np.maximum(e.values - half, list(map(least, names)))
-    intervals = dict(zip(names, np.stack([lows, e.values + half], axis=1).tolist(), strict=True))
-    lag = intervals.get("current_lag", (0.0, 0.0))
-    both = NORMAL_95 * np.stack([noise_deviations(e), e.deviations()], axis=1)
-    halves = dict(zip(names, both.tolist(), strict=True))
+    ends = np.maximum(e.values - half, list(map(least, names))), e.values + half
+    shares = NORMAL_95 * noise_deviations(e), NORMAL_95 * e.deviations()
+    rows = dict(zip(names, np.stack([e.values, *ends, *shares], axis=1).tolist(), strict=True))
+    lag = rows.get("current_lag", (0.0, 0.0, 0.0))[1:3]
     return Identification(
-        values={name: values[name] for name in PARAMETER_NAMES},
-        intervals={name: tuple(intervals[name]) for name in PARAMETER_NAMES},
-        halves={name: tuple(halves[name]) for name in PARAMETER_NAMES},
+        values={name: rows[name][0] for name in PARAMETER_NAMES},
+        intervals={name: tuple(rows[name][1:3]) for name in PARAMETER_NAMES},
+        halves={name: tuple(rows[name][3:]) for name in PARAMETER_NAMES},
         model=best.plant.name,
         fits=best.validation.fits and e.validation.fits,  # an offset explains a wrong model of a small motion
         ratio=e.validation.ratio,
-        command_delay=max(own.quality.command_delay for own in experiments),
+        command_delay=max(one.quality.command_delay for one in experiments),
         measurement_delay=e.plant.instruments.measurement_delay,
         current_lag=(max(0.0, lag[0]), max(0.0, lag[1])),
-        features={name: value for name, value in values.items() if name in FEATURES and name != "current_lag"},
+        features={name: row[0] for name, row in rows.items() if name in FEATURES and name != "current_lag"},
         noise=_residuals(e, bench.noise),
         velocity=velocity,
         objections=tuple(alarms(e) or alarms(best)),
@@ -170,19 +168,19 @@ def _best(
 ) -> Estimate:
     """Estimate by the model that explains the experiments best: the one before, a plain one, one that has grown.
 
-    Of a velocity that is an observer's the angles alone are explained.
-    A delay of the measurements that the data sheet excludes counts only where it explains everything.
+    Of a velocity that is an observer's the angles alone are explained. A delay of the measurements that the data sheet
+    excludes counts only where it explains everything.
     """
     lags = ("current_lag",) if bench.shield.current_lag > 0.0 else ()
-    starts = ("x1_0",) if any(own.x0() != (0.0, 0.0) for own in experiments) else ()  # of a few samples at rest
-    most = bench.shield.frame_age[1] - max(own.quality.command_delay for own in experiments)
+    starts = ("x1_0",) if any(one.x0() != (0.0, 0.0) for one in experiments) else ()  # of a few samples at rest
+    most = bench.shield.frame_age[1] - max(one.quality.command_delay for one in experiments)
 
     def fit(late: int, features: Mapping[str, float], name: str) -> Estimate:
         mechanics = Mechanics(**cast(dict[str, Any], features))
         plant = Plant(name, mechanics, Instruments(measurement_delay=late, observer_bandwidth=observer_bandwidth))
         prior = bench.range_set(bench.shield.ranges)
-        asked = EstimationProblem(PARAMETER_NAMES, (*features, *lags, *starts), prior)
-        return method_of("oem")(bench, plant, asked, starts=STARTS).fit([own.seen_by(plant) for own in experiments])
+        problem = EstimationProblem(PARAMETER_NAMES, (*features, *lags, *starts), prior)
+        return method_of("oem")(bench, plant, problem, starts=STARTS).fit([one.seen_by(plant) for one in experiments])
 
     def misfit(e: Estimate) -> tuple[bool, bool, float]:
         is_excluded = e.plant.instruments.measurement_delay > max(most, 0)

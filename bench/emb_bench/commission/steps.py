@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import onnx
-from onnx import numpy_helper
 
 from emb_bench.commission.records import FirstMove
 from emb_bench.config.bench import Bench
-from emb_runtime.policy.contract import CONTRACT_KEY, MIN_VECTORS, SAMPLE, Contract, PolicyLimits, Vector
+from emb_bench.export.policy_file import model_of, policy_file
+from emb_runtime.policy.contract import SAMPLE
 
-LISTENING = 4.0  # Time to listen [s]: the noise is to be known better than by the residuals of an experiment
+LISTENING = 4.0  # Time to listen [s]: more samples than an experiment has, whose residuals also tell the noise
 SHORT = 0.2  # Duration of the runs that move nothing [s]
 BELOW = 0.5  # Current of the check of the current, as a share of the least that could move any brake of the data sheet
 FIRST_MOVE = 1.3  # Largest current of the first move, in multiples of what moves every brake of the data sheet
@@ -46,7 +45,7 @@ class Step:
     duration: float  # [s]
     stage: tuple[str, ...]  # Options of ``emb-run`` for what may be sent
     window: Window = EVERYWHERE
-    currents: tuple[float, ...] = (0.0,)  # Wanted current by sample [A]; after the last one it stays
+    currents: tuple[float, ...] = (0.0,)  # Requested current by sample [A]; after the last one it stays
 
 
 LISTEN = Step("listen, send nothing", LISTENING, ("--read-only",))
@@ -65,7 +64,7 @@ def current_check(work: Bench) -> Step:
     return Step(
         f"sign, scale and latency of the current with {1e3 * amplitude:.0f} mA, which moves no brake of the data sheet",
         SHORT,
-        ("--limit", repr(amplitude)),  # no way home with a current whose sign and scale are not known yet
+        ("--limit", repr(amplitude)),  # no way home before sign and scale of the current are checked
         Window(-work.shield.home_angle, work.shield.home_angle, work.shield.home_velocity),
         4 * tuple(amplitude * sign for sign in SIGNS for _ in range(5)),
     )
@@ -122,15 +121,13 @@ def experiment(row: Experiment, bench: Bench, move: FirstMove) -> Step:
 # --- their policies -------------------------------------------------------------------------------------------------
 
 
-GRAPH = """
-<ir_version: 10, opset_import: ["" : 20]>
-commissioning (float[1, 3] inputs) => (float[1, 1] outputs) {
+GRAPH = """commissioning (float[1, 3] inputs) => (float[1, 1] outputs) {
   angle, velocity, time = Split <axis = 1, num_outputs = 3> (inputs)
   step = Mul (time, rate)
-  whole = Round (step)
-  number = Cast <to = 7> (whole)
+  rounded = Round (step)
+  number = Cast <to = 7> (rounded)
   place = Min (number, last)
-  wanted = Gather <axis = 0> (currents, place)
+  current = Gather <axis = 0> (currents, place)
   above = Greater (angle, highest)
   fast_up = Greater (velocity, speed)
   no_more_up = Or (above, fast_up)
@@ -141,32 +138,21 @@ commissioning (float[1, 3] inputs) => (float[1, 1] outputs) {
   no_more_down = Or (below, fast_down)
   least = Neg (most)
   lower = Where (no_more_down, zero, least)
-  raised = Max (wanted, lower)
+  raised = Max (current, lower)
   outputs = Min (raised, upper)
 }
 """
 """The current of the step, cut to zero on the side that leads out of the window."""
 
 
-def policy_file(step: Step, bench: Bench) -> bytes:
+def step_policy(step: Step, bench: Bench) -> bytes:
     """The policy of a step, for a bench: its current, but none that drives the brake farther out of the window."""
-    currents, rate = np.asarray(step.currents, np.float32), 1.0 / bench.timing.sample_time
-    numbers = {**step.window._asdict(), "rate": rate, "zero": 0.0, "most": bench.limits.current}
+    currents, t_s = np.array(step.currents), bench.timing.sample_time
+    numbers = {**step.window._asdict(), "rate": 1.0 / t_s, "zero": 0.0, "most": bench.limits.current}
     constants = {name: np.array([value], np.float32) for name, value in numbers.items()}
-    constants |= {"last": np.array(len(currents) - 1), "currents": currents}
-    model = onnx.parser.parse_model(GRAPH)
-    model.graph.initializer.extend(numpy_helper.from_array(value, name) for name, value in constants.items())
-    places = np.linspace(0, len(currents) - 1, MIN_VECTORS).astype(int)
-    contract = Contract(
-        kind="current",
-        inputs=SAMPLE,
-        limits=PolicyLimits(bench.limits.current, bench.limits.angle, bench.limits.velocity),
-        sample_time=bench.timing.sample_time,
-        horizon=bench.timing.horizon,
-        velocity=bench.sensors.velocity,
-        vectors=tuple(Vector((0.0, 0.0, float(k / rate)), (float(currents[k]),)) for k in places),
-        provenance={"commissioning": step.purpose},
-    )
-    model.metadata_props.add(key=CONTRACT_KEY, value=contract.to_json())
-    data: bytes = model.SerializeToString()
-    return data
+    constants |= {"last": np.array(len(currents) - 1), "currents": currents.astype(np.float32)}
+    seen = np.zeros((len(currents), len(SAMPLE)))
+    seen[:, 2] = t_s * np.arange(len(currents))
+    provenance = {"commissioning": step.purpose}
+    model = model_of(GRAPH, constants)
+    return policy_file(model, bench, seen, currents[:, None], provenance, kind="current", inputs=SAMPLE)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -17,17 +18,16 @@ from emb_bench.commission.bench_file import (
     measured_range,
     working_text,
 )
-from emb_bench.commission.comparison import (
-    check_current,
-    check_experiment,
-    check_first_move,
-    check_last,
-    check_noise,
-    check_velocity,
+from emb_bench.commission.examination import noise_in_motion
+from emb_bench.commission.records import (
+    CurrentCheck,
+    Findings,
+    FirstMove,
+    Identification,
+    Velocity,
+    noise_problems,
     suspected,
 )
-from emb_bench.commission.examination import noise_in_motion
-from emb_bench.commission.records import CurrentCheck, Findings, FirstMove, Identification, Velocity
 from emb_bench.commission.steps import (
     EXPERIMENTS,
     FULL,
@@ -39,7 +39,7 @@ from emb_bench.commission.steps import (
     current_check,
     experiment,
     first_move,
-    policy_file,
+    step_policy,
 )
 from emb_bench.config.bench import Bench, load_bench, parse_bench
 from emb_runtime.config.bench import PARAMETER_NAMES, Noise, Sensors
@@ -146,17 +146,20 @@ def test_the_current_check_moves_no_brake_of_the_data_sheet_and_the_first_move_e
     assert limit(steps[2]) == pytest.approx(0.06, abs=0.001)  # 5.2e-3 N·m / 0.0434 N·m/A / 2
 
 
+def require_none(problems: Iterator[EmbError]) -> None:
+    for problem in problems:
+        raise problem
+
+
 def check(finding: Noise | CurrentCheck | FirstMove | Identification, sheet: Bench, *, is_first: bool = True) -> None:
     """Compare a finding with the data sheet."""
     match finding:
         case Noise():
-            check_noise(finding, sheet)
-        case CurrentCheck():
-            check_current(finding, sheet)
-        case FirstMove():
-            check_first_move(finding, sheet)
+            require_none(noise_problems(finding, sheet))
         case Identification():
-            check_experiment(finding, sheet, is_first=is_first)
+            require_none(finding.problems(sheet, is_first=is_first))
+        case _:
+            require_none(finding.problems(sheet))
 
 
 def test_what_contradicts_the_data_sheet_ends_it(sheet: Bench) -> None:
@@ -180,14 +183,14 @@ def test_what_contradicts_the_data_sheet_ends_it(sheet: Bench) -> None:
 def test_a_velocity_that_lags_more_than_is_declared_ends_it(sheet: Bench) -> None:
     observed = Velocity(1500.0, 1410.0, 1520.0)
     for declared in (Sensors("observer", 1500.0), Sensors("observer", velocity_lag=1e-3), Sensors("observer", 750.0)):
-        check_velocity(observed, declared)
-        check_velocity(Velocity(), declared)
+        require_none(observed.problems(declared))
+        require_none(Velocity().problems(declared))
     for declared, words in (
         (Sensors(), "a sensor's"),
         (Sensors("observer", 1600.0), "an observer's, of at least 1600"),
     ):
         with pytest.raises(EmbError, match=rf'declares {words}.* velocity = "observer" and observer_bandwidth = 1410'):
-            check_velocity(observed, declared)
+            require_none(observed.problems(declared))
 
 
 def test_what_agrees_with_the_data_sheet_is_accepted(sheet: Bench) -> None:
@@ -261,8 +264,8 @@ def test_the_last_run_must_not_contradict_the_file(sheet: Bench) -> None:
     one = identification(sheet)
     moved = replace(one, intervals={**one.intervals, "T_c": (0.012, 0.013)})
     with pytest.raises(EmbError, match=r"T_c is 0\.012"):
-        check_last(moved, written)
-    check_last(one, written)
+        require_none(moved.changes(written))
+    require_none(one.changes(written))
 
 
 # --- bench files ----------------------------------------------------------------------------------------------------
@@ -414,11 +417,11 @@ ESTIMATOR = Estimator(load_bench())
 @pytest.fixture(scope="module")
 def policy() -> Policy:
     bench = load_bench()
-    return load_policy(policy_file(STEP, bench), bench)
+    return load_policy(step_policy(STEP, bench), bench)
 
 
 def test_the_file_is_onnx_by_the_reference_checker() -> None:
-    model = onnx.load_from_string(policy_file(STEP, load_bench()))
+    model = onnx.load_from_string(step_policy(STEP, load_bench()))
     onnx.checker.check_model(model, full_check=True)
 
 
