@@ -25,7 +25,15 @@ from emb_runtime.policy.policy import load_policy
 from emb_train import optimum
 from emb_train.cli import main
 from emb_train.closed_loop import Batch, Conditions
-from emb_train.evaluate import Settings, Subject, document, evaluate, open_subject, references, text
+from emb_train.evaluate import (
+    Settings,
+    Subject,
+    evaluate,
+    evaluation_document,
+    evaluation_text,
+    open_subject,
+    references,
+)
 from emb_train.optimum import followed, optima, searchable
 from emb_train.play import MEASURES, STEP, Draw, fresh_draws, mean_score, of_actor, of_law, play
 from emb_train.training import ONNX, PLAN
@@ -245,13 +253,13 @@ def test_the_verdict_and_the_interval_over_policies_are_those_of_the_numbers() -
         plant = found["exact"]
         means = {row.name: row.measure.value for row in plant.rows[2:]}
         best = max(means, key=lambda name: means[name])
-        said = " ".join(text(asked, found).split())
+        said = " ".join(evaluation_text(asked, found).split())
         assert f" {how} " in said
         scores = [row.measure.value for row in plant.rows[:2]]
         theirs = scipy.stats.ttest_1samp(scores, 0.0).confidence_interval(0.95)
         assert plant.over_policies == pytest.approx((np.mean(scores), theirs.low, theirs.high))
         assert math.isnan(mean_score(np.array(scores[:1])).low)
-        record = document(asked, found)["plants"]["exact"]
+        record = evaluation_document(asked, found)["plants"]["exact"]
         assert record["best_reference"] == best
         assert record["over_policies"]["value"] == pytest.approx(np.mean(scores))
 

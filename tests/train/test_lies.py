@@ -10,7 +10,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.safety.state_machine import Fault
 from emb_train.closed_loop import Conditions
 from emb_train.env import EmbExcitationVectorEnv
-from emb_train.lies import LIES, shown
+from emb_train.lies import LIES, clearness
 from emb_train.play import Planned
 from emb_train.rewards import log_determinant
 from tests.scenarios.lies import UNEXPLAINED, run
@@ -34,7 +34,7 @@ def test_a_run_with_a_lie_is_ended_where_the_honest_record_shows_it_clearly_and_
     for speed in speeds:
         env.advance(np.array([[speed]], np.float32))
     e = env.batch.experiments
-    found = shown(BENCH, [BENCH.brake], e.x[:, :, :2], e.applied[:, 1:])[0]
+    found = clearness(BENCH, [BENCH.brake], e.x[:, :, :2], e.applied[:, 1:])[0]
     clear = 0
     for name, share in zip(LIES, found.tolist(), strict=True):
         fault = run(UNEXPLAINED[name], actor=Planned(speeds, BENCH)).outcome.fault

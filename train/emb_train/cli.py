@@ -266,12 +266,14 @@ def evaluate(arguments: argparse.Namespace) -> int:
     """
     from rich.console import Console
 
-    from emb_train.evaluate import document, evaluate, text
+    from emb_train.evaluate import evaluate, evaluation_document, evaluation_text
 
     bench, settings, subjects = prepare(arguments)
     with Console(stderr=True).status("") as status:
         results = evaluate(bench, settings, subjects, status.update)
-    show(json_document(document(settings, results)) if arguments.json else text(settings, results))
+    show(
+        json_document(evaluation_document(settings, results)) if arguments.json else evaluation_text(settings, results)
+    )
     return EXIT_DONE if len(results) == len(settings.plants) else EXIT_INTERRUPTED
 
 

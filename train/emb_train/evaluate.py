@@ -204,7 +204,7 @@ HEADER = ("excitation", "measure", "against optimum", "first ahead by", "left", 
 UNIT: Mapping[str, str] = {"difference": "nat", "log-ratio": "nat", "ratio": ""}
 
 
-def text(settings: Settings, results: Mapping[str, PlantResult]) -> str:
+def evaluation_text(settings: Settings, results: Mapping[str, PlantResult]) -> str:
     """The tables."""
     lines = textwrap.wrap(_scene(settings), WIDTH)
     for name, plant in results.items():
@@ -272,7 +272,7 @@ def _verdict(measure: Measure, plant: PlantResult) -> str:
     )
 
 
-def document(settings: Settings, results: Mapping[str, PlantResult]) -> dict[str, Any]:
+def evaluation_document(settings: Settings, results: Mapping[str, PlantResult]) -> dict[str, Any]:
     """The JSON document; what is not there is null."""
     measure = settings.measure
     of_settings = {name: getattr(settings, name) for name in ("parameters", "ranges", "draws", "seed")}

@@ -78,7 +78,7 @@ LIES: Mapping[str, Callable[[Record], Record]] = {
 """Records as lies of a node would leave them, by what the lie is."""
 
 
-def shown(bench: Bench, brakes: list[BrakeParameters], motion: Floats, currents: Floats) -> Floats:
+def clearness(bench: Bench, brakes: list[BrakeParameters], motion: Floats, currents: Floats) -> Floats:
     """Motion that each lie leaves unexplained in each of N experiments, as a share of what an honest run may leave.
 
     Args:
@@ -104,11 +104,11 @@ def shown(bench: Bench, brakes: list[BrakeParameters], motion: Floats, currents:
             np.stack([record.u for record in records]),
             row,
         )
-        compiled(judge)(*arguments)
+        compiled(judge_records)(*arguments)
     return found
 
 
-def judge(model: BalanceModel, x: Floats, v: Floats, u: Floats, found: Floats) -> None:
+def judge_records(model: BalanceModel, x: Floats, v: Floats, u: Floats, found: Floats) -> None:
     """Let the balance judge some records, at their ends; shapes as in :class:`Record` with one axis before."""
     for i in range(len(found)):
         state = begin(x[i, 0], v[i, 0])

@@ -23,7 +23,7 @@ from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
 from emb_train.closed_loop import Batch, Bools, Positive, Price, Share
 from emb_train.intervals import finite, intervals
-from emb_train.lies import shown
+from emb_train.lies import clearness
 
 OUTWARD = 300  # Steps before the way home begins (5.3)
 HANDOVER = 450  # Step in which the hybrid's quintic is at the origin and eq. 6.6 takes over
@@ -247,9 +247,9 @@ class ExpectedInterval:
             return rewards
         brakes, acted, motion = brakes_of(batch, over), e.applied[over, 1:], e.x[over, :, :2]
         found = intervals(batch.bench, batch.plant.name, batch.parameters, brakes, acted, self.pool)
-        told = shown(batch.bench, brakes, motion, acted)
-        told[batch.experiments.violated[over]] = 0.0  # it was stopped in the middle
-        hidden = np.maximum(demands.shown - told, 0.0)
+        clear = clearness(batch.bench, brakes, motion, acted)
+        clear[batch.experiments.violated[over]] = 0.0  # it was stopped in the middle
+        hidden = np.maximum(demands.shown - clear, 0.0)
         beyond = np.maximum(demands.release * batch.bench.limits.angle[0] - motion[:, :, 0].min(axis=1), 0.0)
         prices = demands.astray * ~batch.home[over] + demands.beyond * beyond + demands.hidden * hidden.sum(axis=1)
         rewards[over] = finite([self.criterion.of(one) for one in found]) - prices

@@ -155,7 +155,7 @@ OF_A_PARAMETER = {
 """Columns of each parameter, behind its name and an underscore."""
 
 
-def columns(names: Sequence[str]) -> dict[str, Column]:
+def row_columns(names: Sequence[str]) -> dict[str, Column]:
     """All columns of a file about some parameters."""
     return COLUMNS | {
         f"{name}_{key}": one._replace(unit=unit_of(name, one.unit))
@@ -204,7 +204,7 @@ def write_rows(
     }
     described = [
         pa.field(name, kinds[one.kind], metadata={k: v for k, v in (("about", one.about), ("unit", one.unit)) if v})
-        for name, one in columns(options.unknowns_on(bench)).items()
+        for name, one in row_columns(options.unknowns_on(bench)).items()
     ]
     table = pa.Table.from_pylist(list(rows), pa.schema(described, metadata=about))
     if ending == ".parquet":

@@ -104,7 +104,7 @@ def counting(rows: Sequence[Row]) -> list[Row]:
     return [row for row in rows if row["error"] is None and row.get("copy_of") is None]
 
 
-def document(c: Campaign) -> dict[str, Any]:
+def campaign_document(c: Campaign) -> dict[str, Any]:
     """The summary as plain data; of single logs their names, errors and results."""
     found: dict[str, Any] = to_json(replace(c, failed=(), copies=(), stopped=(), misfit=(), outside=()))
     keys = ("root", "log", "error", "copy_of", "exit_reason", "model", "outside")
@@ -193,7 +193,7 @@ def _estimates(used: Sequence[Row], name: str) -> ParameterEstimates | None:
     )
 
 
-def text(c: Campaign, *, verbose: bool = False) -> str:
+def campaign_text(c: Campaign, *, verbose: bool = False) -> str:
     """Number of failures, the parameters over all runs, and their agreement; with ``verbose`` each log with a note."""
     most = None if verbose else SHOWN
     lines = []

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from emb_bench import api
-from emb_bench.cli.options import add, add_output_options, answer, given, summary
+from emb_bench.cli.options import add, add_output_options, given, print_answer, summary
 from emb_bench.output import require_place
 from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError
 from emb_runtime.system.terminal import Parser, complain, mention
@@ -64,7 +64,7 @@ def _design(args: argparse.Namespace) -> int:
         write(report, args.output)
     from emb_bench.report.design import text
 
-    answer(args, report.metadata, lambda verbose: text(report, str(args.output or ""), verbose=verbose))
+    print_answer(args, report.metadata, lambda verbose: text(report, str(args.output or ""), verbose=verbose))
     if report.found.interrupted:
         mention("emb-design: interrupted; this is the best design so far")
         return EXIT_INTERRUPTED

@@ -58,7 +58,7 @@ def add_output_options(p: argparse.ArgumentParser) -> None:
     group.add_argument("-q", "--quiet", action="store_true", help="print the verdict only")
 
 
-def answer(args: argparse.Namespace, document: Callable[[], Any], text: Callable[[bool], str]) -> None:
+def print_answer(args: argparse.Namespace, document: Callable[[], Any], text: Callable[[bool], str]) -> None:
     """Print a result as the options of :func:`add_output_options` say; ``text`` takes True if it is to be verbose."""
     if args.json:
         show(json_document(document()))

@@ -13,7 +13,7 @@ from emb_bench import api
 from emb_bench.api.arguments import opened
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.cli.live import LiveOptions, live
-from emb_bench.cli.options import add, add_output_options, answer, description, given, summary
+from emb_bench.cli.options import add, add_output_options, description, given, print_answer, summary
 from emb_bench.options import Options
 from emb_bench.output import reported_if_interrupted
 from emb_bench.report.text import show
@@ -53,7 +53,7 @@ def _fim(args: argparse.Namespace) -> int:
     from emb_bench.report import fim
 
     found = cast("Evaluation", api.fisher_information(args.run, given(args, api.FimOptions)))  # of one log
-    answer(args, lambda: fim.document(found), lambda verbose: fim.text(found, verbose=verbose))
+    print_answer(args, lambda: fim.document(found), lambda verbose: fim.text(found, verbose=verbose))
     return EXIT_DONE
 
 
@@ -61,7 +61,7 @@ def _estimate(args: argparse.Namespace) -> int:
     study = api.estimate(args.runs, given(args, api.EstimateOptions))
     from emb_bench.report.estimate import document, text
 
-    answer(args, lambda: document(study), lambda verbose: text(study, verbose=verbose))
+    print_answer(args, lambda: document(study), lambda verbose: text(study, verbose=verbose))
     return _exit_code(study, strict=args.strict)
 
 
@@ -99,15 +99,15 @@ def _export(args: argparse.Namespace) -> int:
     holds = api.export(log, args.output, options)
     warning = f"WARNING: {log.missing}\n" if log.missing else ""
     document = {"log": str(args.run), "file": str(args.output), "holds": holds, "missing": log.missing}
-    answer(args, lambda: document, lambda _: f"{warning}{args.output}: {holds}")
+    print_answer(args, lambda: document, lambda _: f"{warning}{args.output}: {holds}")
     return EXIT_DONE
 
 
 def _campaign(args: argparse.Namespace) -> int:
     found = api.campaign(args.paths, args.output, given(args, api.CampaignOptions))
-    from emb_bench.batch.summary import document, text
+    from emb_bench.batch.summary import campaign_document, campaign_text
 
-    answer(args, lambda: document(found), lambda verbose: text(found, verbose=verbose))
+    print_answer(args, lambda: campaign_document(found), lambda verbose: campaign_text(found, verbose=verbose))
     if not found.evaluated:
         return EXIT_LOG
     return EXIT_CHECK_FAILED if found.failed else EXIT_DONE
@@ -117,7 +117,7 @@ def _rerun(args: argparse.Namespace) -> int:
     from emb_bench.report import runs
 
     again = api.rerun(args.run)
-    answer(args, lambda: runs.rerun_document(again), lambda verbose: runs.rerun_text(again, verbose=verbose))
+    print_answer(args, lambda: runs.rerun_document(again), lambda verbose: runs.rerun_text(again, verbose=verbose))
     return EXIT_DONE if again.reproduced else EXIT_CHECK_FAILED
 
 
@@ -125,7 +125,7 @@ def _info(args: argparse.Namespace) -> int:
     from emb_bench.report import runs
 
     document = api.info(args.run)
-    answer(args, lambda: document, lambda verbose: runs.info(document, verbose=verbose))
+    print_answer(args, lambda: document, lambda verbose: runs.info(document, verbose=verbose))
     return EXIT_DONE
 
 
@@ -133,7 +133,7 @@ def _timing(args: argparse.Namespace) -> int:
     from emb_bench.report import runs
 
     found = api.timing(args.runs)
-    answer(
+    print_answer(
         args,
         lambda: {"logs": [runs.timing_document(entry) for entry in found]},
         lambda verbose: "\n\n".join(runs.timing_text(entry, verbose=verbose) for entry in found),

@@ -41,13 +41,13 @@ def chunks(path: Path, wait: Callable[[], bool], bench: Callable[[bytes], object
     """
     try:
         with open_regular(path) as file:
-            if _read(file, len(MAGIC), wait) not in (MAGIC, None):
+            if _bytes_once_there(file, len(MAGIC), wait) not in (MAGIC, None):
                 raise LogError(f"{path}: not an MCAP file")
-            while (head := _read(file, RECORD.size, wait)) is not None:
+            while (head := _bytes_once_there(file, RECORD.size, wait)) is not None:
                 opcode, length = RECORD.unpack(head)
                 if length > max(LARGEST, MOST_CARRIED):
                     raise LogError(f"{path}: a record in it claims {length} bytes, none of ours has so many")
-                body = _read(file, length, wait)
+                body = _bytes_once_there(file, length, wait)
                 if body is None or opcode == Opcode.FOOTER:
                     return
                 if opcode == Opcode.CHUNK:
@@ -62,7 +62,7 @@ def chunks(path: Path, wait: Callable[[], bool], bench: Callable[[bytes], object
         raise LogError(f"{path}: damaged: {err}") from err
 
 
-def _read(file: BinaryIO, count: int, wait: Callable[[], bool]) -> bytes | None:
+def _bytes_once_there(file: BinaryIO, count: int, wait: Callable[[], bool]) -> bytes | None:
     """So many bytes, once they are there; None where they will not come."""
     data, goes_on = b"", True
     while len(data) < count:

@@ -31,9 +31,9 @@ from emb_bench.logs.mcap_file import (
     Chunk,
     Column,
     McapFile,
-    columns,
     describe,
     message_class,
+    message_columns,
     message_of,
     unpack_chunk,
 )
@@ -208,7 +208,7 @@ class RunLog:
             right = np.lexsort((sequence, np.cumsum(np.diff(log_time, prepend=0) != 0)))
             times, payloads = times[right], [payloads[i] for i in right.tolist()]
         try:
-            fields = columns(factory, payloads)
+            fields = message_columns(factory, payloads)
             return _times(times["publish"], times["log"]) | {"order": order} | fields
         except UNREADABLE as err:
             raise LogError(f"{self.path}: the messages of {topic} are not readable: {message_of(err)}") from err

@@ -382,7 +382,7 @@ def describe(factory: Any, units: str = "{}") -> tuple[Column, ...]:
     return tuple(found)
 
 
-def columns(factory: Any, payloads: Sequence[bytes]) -> dict[str, NDArray[Any]]:
+def message_columns(factory: Any, payloads: Sequence[bytes]) -> dict[str, NDArray[Any]]:
     """The fields of n serialised messages, each of shape (n,), but those that are messages themselves.
 
     Numbers are int64 or float64, bool is bool, text and bytes are objects. The messages are parsed as one whose fields

@@ -83,7 +83,7 @@ class BudgetCheck(NamedTuple):
         return self.measured is not None and self.measured <= self.budget
 
 
-def judge(t: Timing, budgets: Budgets) -> list[BudgetCheck]:
+def check_budgets(t: Timing, budgets: Budgets) -> list[BudgetCheck]:
     """Every budget beside what a run took."""
     checks = [BudgetCheck(name, budgets.shares[name], t.share(name)) for name in COUNTED if name in budgets.shares]
     for name, limits in budgets.intervals.items():
@@ -131,7 +131,7 @@ def quantiles(values: Floats) -> dict[str, float]:
     return dict(zip(QUANTILE_NAMES, np.percentile(values, QUANTILES).tolist(), strict=True))
 
 
-def document(t: Timing) -> dict[str, Any]:
+def timing_numbers(t: Timing) -> dict[str, Any]:
     """The timing in numbers [s]; of an interval that nothing was measured of, no quantiles."""
     return {
         "simulated": t.simulated,

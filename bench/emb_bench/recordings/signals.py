@@ -47,7 +47,7 @@ def experiment_of(
     """
     given, timing, name = recording_map.signals.given, recording_map.timing, Path(source).name
     source += f" (head in line {lacks[Lack.HEAD][0]})" if Lack.HEAD in lacks else ""
-    read = _read(columns, recording_map, source)
+    read = _checked_signals(columns, recording_map, source)
     signals = {
         name: (series.times + given[name].delay, _in_si(series.values, given[name])) for name, series in read.items()
     }
@@ -108,7 +108,7 @@ def experiment_of(
     return Found(experiment, t_s, (angle_noise, velocity_noise), bandwidth)
 
 
-def _read(columns: Mapping[Place, Column], recording_map: RecordingMap, source: str) -> dict[str, Series]:
+def _checked_signals(columns: Mapping[Place, Column], recording_map: RecordingMap, source: str) -> dict[str, Series]:
     """The signals without faults, angles continued over their period; rows that repeat the one before are left out."""
     given, clock = recording_map.signals.given, _clock(columns, recording_map)
     first = recording_map.file.rows[0] if recording_map.file.rows else 1

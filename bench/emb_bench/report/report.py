@@ -628,7 +628,7 @@ def _run_document(run: StudiedRun, study: Study) -> dict[str, Any]:
         "why_not_estimated": run.why_not,
         "sha256": run.log.sha256,
         "info": None if run.log.is_recording else info_document(run.log),
-        "timing": None if run.timing is None else timing.document(run.timing),
+        "timing": None if run.timing is None else timing.timing_numbers(run.timing),
     }
     x, alone = run.experiment, run.alone
     if x is not None:

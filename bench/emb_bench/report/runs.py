@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from emb_bench.config.bench import COUNTED, QUANTILE_NAMES
 from emb_bench.config.conditions import CONDITIONS
 from emb_bench.logs.log import RunLog, end_detail
-from emb_bench.logs.timing import INTERVALS, BudgetCheck, Timing, document, judge, quantiles, timing
+from emb_bench.logs.timing import INTERVALS, BudgetCheck, Timing, check_budgets, quantiles, timing, timing_numbers
 from emb_bench.numbers import percent, seconds
 from emb_bench.report.text import Table, facts, listed, wrapped
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_USAGE
@@ -113,7 +113,7 @@ def run_timing(log: RunLog) -> RunTiming:
         return RunTiming(log, t, (), f"the time ran {ran}")
     if budgets is None:
         return RunTiming(log, t, (), "the bench file in the log has no [budgets]")
-    checks = tuple(judge(t, budgets))
+    checks = tuple(check_budgets(t, budgets))
     return RunTiming(log, t, checks, "" if checks else "the [budgets] of the bench file in the log are empty")
 
 
@@ -122,7 +122,7 @@ def timing_document(entry: RunTiming) -> dict[str, Any]:
     return {
         "log": str(entry.log.path),
         "missing": entry.log.missing,
-        **document(entry.timing),
+        **timing_numbers(entry.timing),
         "budgets": [{**check._asdict(), "met": check.met} for check in entry.checks],
         "not_judged": entry.why_not,
         "met": None if entry.why_not else all(check.met for check in entry.checks),

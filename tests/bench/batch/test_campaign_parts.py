@@ -18,7 +18,7 @@ from pyarrow import parquet
 from emb_bench.analysis.several_runs import constancy
 from emb_bench.batch.campaign import find
 from emb_bench.batch.row import CampaignOptions, Row, Source, failed, write_rows
-from emb_bench.batch.summary import Campaign, mark_copies, summarise, text
+from emb_bench.batch.summary import Campaign, campaign_text, mark_copies, summarise
 from emb_bench.output import replacing
 from emb_runtime.errors import UsageError
 
@@ -214,4 +214,4 @@ def test_a_misfit_is_named_and_has_no_part_in_the_mean() -> None:
     assert (estimate.runs, estimate.constancy.constant) == (3, False)
     assert estimate.constancy.mean == pytest.approx(3.02e-2, rel=0.01)
     assert estimate.total == pytest.approx(0.1 * 2.99e-2)
-    assert "3.mcap" in text(found, verbose=True)
+    assert "3.mcap" in campaign_text(found, verbose=True)

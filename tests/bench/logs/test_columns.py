@@ -10,7 +10,7 @@ from google.protobuf.message import DecodeError
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emb_bench.logs.mcap_file import columns, message_class
+from emb_bench.logs.mcap_file import message_class, message_columns
 
 KINDS = {
     "real": "double",
@@ -57,7 +57,7 @@ TYPES = {"real": np.float64, "flag": np.bool_, "text": np.object_, "data": np.ob
 @settings(deadline=None, max_examples=100)
 @given(MESSAGES)
 def test_columns_hold_what_was_written_and_zero_where_nothing_was(messages: list[dict[str, Any]]) -> None:
-    found = columns(ALL, [ALL(**message).SerializeToString() for message in messages])
+    found = message_columns(ALL, [ALL(**message).SerializeToString() for message in messages])
     assert set(found) == set(KINDS)
     for name, column in found.items():
         assert column.dtype == TYPES.get(name, np.int64)
@@ -69,7 +69,7 @@ def test_columns_hold_what_was_written_and_zero_where_nothing_was(messages: list
 @given(st.lists(st.binary(max_size=40), min_size=1, max_size=4))
 def test_any_bytes_are_columns_of_one_row_each_or_refused(payloads: list[bytes]) -> None:
     with suppress(DecodeError, OverflowError):
-        found = columns(ALL, payloads)
+        found = message_columns(ALL, payloads)
         assert {column.shape for column in found.values()} == {(len(payloads),)}
 
 
@@ -81,12 +81,12 @@ def test_a_message_that_was_cut_takes_nothing_of_the_next() -> None:
             last = ALL.FromString(payload[:length])
         except DecodeError:
             with pytest.raises(DecodeError):
-                columns(ALL, [payload, payload[:length], payload])
+                message_columns(ALL, [payload, payload[:length], payload])
         else:
-            found = columns(ALL, [payload, payload[:length], payload])
+            found = message_columns(ALL, [payload, payload[:length], payload])
             assert {name: column[1] for name, column in found.items()} == {name: getattr(last, name) for name in KINDS}
 
 
 def test_a_number_beyond_63_bits_is_refused() -> None:
     with pytest.raises(OverflowError):
-        columns(ALL, [ALL(natural=2**63).SerializeToString()])
+        message_columns(ALL, [ALL(natural=2**63).SerializeToString()])

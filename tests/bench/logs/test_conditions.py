@@ -16,7 +16,7 @@ from pyarrow import parquet
 from emb_bench.analysis.several_runs import beyond, slope
 from emb_bench.batch.chart import draw_chart
 from emb_bench.batch.row import CampaignOptions, Row
-from emb_bench.batch.summary import summarise, text
+from emb_bench.batch.summary import campaign_text, summarise
 from emb_bench.logs.log import read_log
 from emb_runtime.can.messages import load_layout
 from emb_runtime.log.recorder_process import LogWriter
@@ -154,7 +154,7 @@ def test_a_chart_has_the_conditions_that_were_sent_the_limits_and_the_runs_beyon
 ) -> None:
     path, rows = tmp_path / "chart.svg", rows_of([1.0, 1.1, 1.2, 1.3, 1.4], apart)
     found = summarise(rows, OF_K_M_AND_F_V, "rows.csv")
-    said = " ".join(text(found).split())
+    said = " ".join(campaign_text(found).split())
     assert f"f_v changes with time: +{change} % per {unit} (p <" in said
     assert "f_v changes with temperature: +8.33 % per °C" in said
     assert "f_v: beyond the control limits (3 deviations between runs from the median): 0.mcap, 1.mcap, 3." in said

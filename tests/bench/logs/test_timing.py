@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from emb_bench.logs.log import read_log
-from emb_bench.logs.timing import INTERVALS, Timing, document, timing
+from emb_bench.logs.timing import INTERVALS, Timing, timing, timing_numbers
 from emb_runtime.can.e2e import NO_COUNTER
 from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import Bench
@@ -118,7 +118,7 @@ def test_a_log_without_an_experiment_has_no_intervals_and_no_clock(measure: Meas
     t = measure(cycle(-1, START))
     assert all(len(t.interval(name)) == 0 for name in INTERVALS)
     assert t.clock is None
-    assert document(t)["intervals"] == {name: {} for name in INTERVALS}
+    assert timing_numbers(t)["intervals"] == {name: {} for name in INTERVALS}
 
 
 def test_the_counts_are_the_loop_s_and_a_simulation_is_called_so(

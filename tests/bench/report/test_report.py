@@ -21,8 +21,7 @@ from emb_bench.analysis.options import EstimateOptions
 from emb_bench.analysis.stages import make_study
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import CampaignOptions, Source
-from emb_bench.batch.summary import summarise
-from emb_bench.batch.summary import text as text_of_campaign
+from emb_bench.batch.summary import campaign_text, summarise
 from emb_bench.brake.parameters import quantity
 from emb_bench.cli.replay import main
 from emb_bench.config.bench import Bench
@@ -464,4 +463,4 @@ def test_a_brake_outside_of_the_shield_s_ranges_is_said_everywhere(
     made = make(folder / "stiff.html", path, "--starts", "1", "--strict", code=EXIT_OUTSIDE)
     assert any(line.startswith("OUTSIDE: k_1") for line in made.reader.texts[:4])
     row = evaluate_one(Source(str(path), "", path.name, "."), CampaignOptions(starts=1))
-    assert "OUTSIDE: stiff.mcap: k_1" in text_of_campaign(summarise([row], CampaignOptions(), "rows.csv"))
+    assert "OUTSIDE: stiff.mcap: k_1" in campaign_text(summarise([row], CampaignOptions(), "rows.csv"))
