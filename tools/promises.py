@@ -22,6 +22,13 @@ SECTIONS = {
         ("## Files from outside\n", "A policy from"),
         ("## Viewers\n", "\n## "),
     ],
+    "docs/howto/first-contact.md": [("If a check fails", "\n\n")],
+    "docs/howto/map-a-drive.md": [("It waits for samples", "**From then")],
+    "docs/howto/read-a-log.md": [("Every command that prints", "\n\n")],
+    "docs/reference/bench-toml.md": [("An unknown key", "\n\n"), ("A bench file can narrow", "The\nlongest values")],
+    "docs/reference/contract.md": [("If a policy does not fit", "\n\n"), ("An output that is not finite", "\n\n")],
+    "docs/reference/fault-codes.md": [("A latched fault", "The codes")],
+    "docs/reference/log-topics.md": [("A log that was cut", "\n\n"), ("A log that does not hold", "Texts that")],
 }
 """Parts of a page, from one text to another, of which every sentence is a promise."""
 WORDS = re.compile(
