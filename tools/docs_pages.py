@@ -127,7 +127,7 @@ class _Parsed(BaseException):
 
 
 def command_parsers() -> dict[str, argparse.ArgumentParser]:
-    """The parser of each command in ``pyproject.toml``: what its entry point parses its arguments with."""
+    """The argument parser of each command in ``pyproject.toml``."""
 
     def caught(self: argparse.ArgumentParser, *_: Any, **__: Any) -> None:
         raise _Parsed(self)

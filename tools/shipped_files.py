@@ -1,4 +1,4 @@
-"""Writes what is shipped and made from the code: JSON schemas of the files that a user writes, and shell completion.
+"""Writes the shipped files that are made from the code: JSON schemas of users' files, and shell completion.
 
     python -m tools.shipped_files
 
@@ -107,7 +107,7 @@ def _struct(name: str, doc: str, fields: Mapping[str, tuple[Any, ...]]) -> Any:
 
 
 def _fields(kind: type) -> dict[str, tuple[Any, ...]]:
-    """Type of each field of a record, with what the code says of it, and its default if it has one."""
+    """Type of each field of a record, with its comment, and its default if it has one."""
     hints, found = get_type_hints(kind, include_extras=True), dict[str, tuple[Any, ...]]()
     ours = [base for base in reversed(kind.__mro__) if base.__module__.startswith("emb_")]
     comments = {name: line or text for base in ours for name, line, text in _FIELD.findall(inspect.getsource(base))}

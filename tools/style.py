@@ -74,7 +74,7 @@ def problems(root: Path) -> Iterator[str]:
 
 
 def main() -> int:
-    """Print what is found; 1 if anything is."""
+    """Print the problems; 1 if there is one."""
     found = [line.replace(f"{ROOT}/", "") for line in problems(ROOT)]
     sys.stdout.writelines(f"{line}\n" for line in found)
     return 1 if found else 0

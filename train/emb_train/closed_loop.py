@@ -68,7 +68,7 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Observation of the actor: ``measured`` angle, velocity and step; these and the running ``estimate`` of the four
     parameters with its deviations; or ``everything`` (x₁, x₂, k, θ, the FIM)."""
     systematic: bool = False
-    """Draw the offsets of encoder and current from the bench's priors; a wrong scale is what no shield can know."""
+    """Draw the offsets of encoder and current from the bench's priors, but no wrong scale, which no shield detects."""
     information: Kind = "weighted"  # Fisher information that is collected: the thesis's, or the physical one
     draws: Literal["uniform", "normal"] = "uniform"
     """Distribution of the brakes in their ranges: normal is cut off at both ends, two standard deviations away."""
@@ -80,7 +80,7 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gain: Gain = 1.0  # Of the speed loop; less where commands act late
 
     def __post_init__(self) -> None:
-        """Refuse what does not exist.
+        """Refuse impossible conditions.
 
         Raises:
             UsageError: the delay or the horizon is out of its bounds.
@@ -145,7 +145,7 @@ class Setup(NamedTuple):
     velocity_weight: float  # Of the velocity
     damping_velocity: float  # Of the node that brakes by itself [rad/s]; infinite for one that lets go
     estimates: bool  # True if the estimator is in the loop
-    follows: bool  # True if what is requested is a target speed, which the speed loop follows
+    follows: bool  # True if an action is a target speed, which the speed loop follows
     gain: float  # Of the speed loop
 
 

@@ -48,7 +48,7 @@ Tell = Callable[[str], object]
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A policy, with what it was made for."""
+    """A policy, with its bench and ranges."""
 
     name: str  # As it was given
     bench: Bench
@@ -273,7 +273,7 @@ def _verdict(measure: Measure, plant: PlantResult) -> str:
 
 
 def evaluation_document(settings: Settings, results: Mapping[str, PlantResult]) -> dict[str, Any]:
-    """The JSON document; what is not there is null."""
+    """The JSON document; a missing value is null."""
     measure = settings.measure
     of_settings = {name: getattr(settings, name) for name in ("parameters", "ranges", "draws", "seed")}
     of_measure = {"measure": measure.name, "measure_is": measure.label, "unit": UNIT[measure.against]}

@@ -3,7 +3,7 @@
 The runtime ends a run whose motion is that of no one brake (:mod:`emb_runtime.safety.motion_balance`). Whether it can
 tell depends on the excitation: a scale that slides is seen in long strokes, not in a creep. Here the record of an
 honest experiment is changed as a lie changes it, and the balance judges it. The loop follows what the node tells: with
-a wrong sensor the motion that is told stays, and the true one changes with its currents.
+a wrong sensor the reported motion stays, and the true one changes with its currents.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.safety.motion_balance import BalanceModel, balance_model, begin, origin, take, unexplained
 
-SWING = 10.0 * np.pi  # Angular frequency of what swings [rad/s]
+SWING = 10.0 * np.pi  # Angular frequency of a swinging scale [rad/s]
 
 
 class Record(NamedTuple):
@@ -43,19 +43,19 @@ class Record(NamedTuple):
         return self.at[:-1] + 0.5 * self.ts
 
     def moved(self, x: Floats, v: Floats) -> Record:
-        """The record where the true motion is another one, shape [n + 1] each: the loop follows what it is told."""
+        """The record with another true motion, shape [n + 1] each: the loop follows the reported one."""
         brake, more = self.brake, v - self.v
         spring = brake.gamma * brake.k_1 * (np.maximum(x, 0.0) - np.maximum(self.x, 0.0))[1:]
         return self.pulled(brake.J * np.diff(more) / self.ts + spring + brake.f_v * more[1:])
 
     def scaled(self, scale: Floats) -> Record:
-        """The record where angle and velocity are told by a scale, shape [n + 1]; the angle stays an integral."""
+        """The record with scaled angle and velocity, shape [n + 1]; the angle stays the integral of the velocity."""
         v = self.v / scale
         moves = 0.5 * self.ts * (v[1:] + v[:-1])
         return self.moved(self.x[0] + np.concatenate([[0.0], np.cumsum(moves)]), v)
 
     def pulled(self, torque: Floats) -> Record:
-        """The record where a torque acts that nobody knows of, which the current overcomes [N·m], shape [n]."""
+        """The record with an additional torque, which the current overcomes [N·m], shape [n]."""
         return self._replace(u=self.u + torque / self.brake.k_m)
 
 
@@ -75,7 +75,7 @@ LIES: Mapping[str, Callable[[Record], Record]] = {
         -0.5 * r.brake.gamma * r.brake.k_1 * np.maximum(r.x[1:], 0.0) * (r.within > 0.25)
     ),
 }
-"""Records as lies of a node would leave them, by what the lie is."""
+"""The changes of a record by the lies of a node, by name."""
 
 
 def clearness(bench: Bench, brakes: list[BrakeParameters], motion: Floats, currents: Floats) -> Floats:

@@ -23,7 +23,7 @@ from emb_train.training import Trained, Training
 
 
 def network_file(trained: Trained, training: Training, bench: Bench) -> tuple[bytes, str]:
-    """The policy file of a trained actor that observes what a bench measures, and its origin in words.
+    """The policy file of a trained actor with the observations of a bench, and its origin in words.
 
     Raises:
         PolicyRefusedError: the network's answers are not finite, or the file would differ from it.

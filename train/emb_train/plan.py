@@ -1,4 +1,4 @@
-"""Search for a plan of speeds for brakes that nobody knows: a few levels and their times, by CMA-ES.
+"""Search for a plan of speeds for unknown brakes: a few levels and their times, by CMA-ES.
 
 A plan holds n levels of speed, for a time each, and then the shield brings the brake home; it depends on no
 measurement. Its 2 n numbers lie within ±1: the signed root of each level, so that a creep of some rad/s is as wide as

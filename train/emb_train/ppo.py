@@ -37,7 +37,7 @@ FINENESS = 9.0  # A speed is sinh(9 a)/sinh 9 of the limit for the action a
 
 
 class TrainingDivergedError(EmbError):
-    """A loss, reward or weight is not finite any more: what follows would be worthless."""
+    """A loss, reward or weight is not finite any more: further training would be worthless."""
 
     exit_code = 1
 
@@ -419,7 +419,7 @@ def collect_all(
 
 
 def at_once(work: Callable[..., Result], *arguments: Sequence[Any]) -> list[Result]:
-    """The results of work with several environments: while one steps, another may wait for what processes do."""
+    """The results of work with several environments: while one steps, another may wait for processes."""
     with ThreadPoolExecutor(processors()) as threads:
         return list(threads.map(work, *arguments))
 

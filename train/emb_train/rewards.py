@@ -142,7 +142,7 @@ def squared_determinant_gain(t: Transition) -> Floats:
 
 
 def log_determinant(t: Transition) -> Floats:
-    """Increment of ln |M + 12 I| (D, eq. 4.12-4.13): what the prior of ±50 % tells earns nothing."""
+    """Increment of ln |M + 12 I| (D, eq. 4.12-4.13): the information of the prior of ±50 % earns nothing."""
     return gain(LOG_DET, t, PRIOR)
 
 
@@ -212,7 +212,7 @@ def _explored(t: Transition, back: Floats) -> Floats:
 
 
 class Demands(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Demands on an experiment besides telling much, and what it pays where it does not meet them.
+    """Demands on an experiment besides its information, and the prices where it does not meet them.
 
     A sensor that lies moves a brake by some radians before it is found out: there is to be room on the side of the
     release. And the motion is to show that a node lies (:mod:`emb_train.lies`).
@@ -222,7 +222,7 @@ class Demands(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     release: Share = 0.3  # Part of the way to the lowest angle that is free
     beyond: Price = 1.0  # Price of each radian beyond it [nat]
     shown: Price = 1.15  # How clearly the motion shows each lie; above 1 a run is ended
-    hidden: Price = 10.0  # Price of what a lie is short of that [nat]
+    hidden: Price = 10.0  # Price of each unit that a lie is short of that [nat]
 
 
 DEMANDS = Demands()

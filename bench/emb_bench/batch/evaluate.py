@@ -45,7 +45,9 @@ def evaluate_one(source: Source, options: CampaignOptions, bench: Bench | None =
             row |= found
     except EmbError as err:
         return row | {"error": failed(source, str(err))["error"]}
-    except Exception as err:  # no log may cost the others theirs, and a fault of ours is reported like one of the log
+    except (
+        Exception
+    ) as err:  # one log must not end the campaign; a fault of the program is reported like one of the log
         return row | {"error": failed(source, f"{source.path}: {type(err).__name__}: {err}")["error"]}
     return row | {"error": None}
 
@@ -65,7 +67,7 @@ def _steps(source: Source, options: CampaignOptions, given: Bench | None) -> Ite
     question = options.question(bench)
     experiment = read_experiment(log, bench, source.path)
     yield _of_the_experiment(log, experiment, bench) | {"model": plant.name}
-    import numba  # noqa: F401  # what is loaded is used, which pays for many logs and not for one
+    import numba  # noqa: F401  # evaluate uses it once it is loaded, which pays for many logs
 
     (evaluation,) = evaluate(log, experiment, bench, [plant], question, "nominal", bench.brake)
     yield _of_the_information(evaluation)
@@ -124,7 +126,7 @@ def _of_the_experiment(log: RunLog, experiment: Experiment, bench: Bench) -> Row
 
 
 def _beginning(experiment: Experiment) -> str | None:
-    """A fingerprint of the first samples, whatever the file is called and wherever it was cut; none of ideal ones."""
+    """A fingerprint of the first samples, the same in each copy of a log, also a cut one; None of ideal samples."""
     samples = np.ascontiguousarray(experiment.samples[:FIRST].T)
     seen = samples[:, ~np.isnan(samples).any(axis=0)]
     if not (seen != seen[:, :1]).any():

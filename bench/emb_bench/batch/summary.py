@@ -148,7 +148,7 @@ def is_usable(row: Row, name: str) -> bool:
 def columns_of(used: Sequence[Row], name: str) -> dict[str, NDArray[np.float64]]:
     """Columns of a parameter, by name; the deviation between runs in SI units."""
     found = {key: np.array([row.get(f"{name}_{key}") for row in used], np.float64) for key in OF_AN_ESTIMATE}
-    if PARAMETERS[name].relative:  # shares are of one number, so that what came out small weighs no more
+    if PARAMETERS[name].relative:  # all shares are of the median: a small estimate does not weigh more
         found["between_runs"] *= abs(float(np.median(found["estimate"])))
     return found
 

@@ -75,7 +75,7 @@ def run_node(
     passed = skipped_total = 0
     deadline_ns = clock.now_ns() + period_ns
     while not stop_requested() and (periods is None or passed < periods):
-        # Asleep until the tick, not woken by each frame: what has come meanwhile is received then, and acts no earlier.
+        # Asleep until the tick, not woken by each frame: frames are received at the tick, and act no earlier.
         skipped = (clock.sleep_until(deadline_ns) - deadline_ns) // period_ns
         for _ in range(MAX_FRAMES):
             if (frame := transport.receive(0)) is None:
@@ -132,7 +132,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _print_summary(node: BrakeNode, skipped: int, as_json: bool) -> None:
-    """Print what the node did, and how the brake moved."""
+    """Print the counts of the node, and the extremes of the motion."""
     did = {
         "samples": node.samples,
         "skipped_periods": skipped,

@@ -46,7 +46,7 @@ methods:
 UNKNOWNS = METHODS + "\nThe names of unknowns are in the help of emb-replay estimate.\n"
 
 
-# ---- what each command does, from its arguments to its exit code ----
+# ---- the functions of the commands, from arguments to exit code ----
 
 
 def _fim(args: argparse.Namespace) -> int:
@@ -165,7 +165,7 @@ class Command(NamedTuple):
     argument_help: str = "MCAP file of emb-run"
     options: type[Options] = Options
     output: str = ""  # Help of ``--output``, if the command has it
-    more: str = ""  # Help below what the docstring says
+    more: str = ""  # Help below the docstring
     strict: str = ""  # Help of ``--strict``, if the command has it
 
 

@@ -30,7 +30,7 @@ from emb_runtime.system import terminal
 
 WORKING, FASTER, FOUND = "working.toml", "working-2.toml", "bench.toml"
 """Names of the bench files in the folder: up to the free stroke, with the velocity found there, and in the end."""
-RECENT = 2  # Experiments that the parameters are estimated from: each is larger and tells more than those before it
+RECENT = 2  # Experiments that the parameters are estimated from: each is larger than those before it
 OUTSIDE = {Fault.OUT_OF_LIMITS.name, Fault.MOTION_OUTSIDE_SET.name}
 """Results by which the brake may lie outside of the data sheet's ranges."""
 SIMULATED = ("sim", "sim-drive")  # Buses whose brake is made anew for each run
@@ -211,7 +211,7 @@ def simulated(iface: str, sheet: Bench, run: int) -> str:
 
     Any other bus stays as it is.
     """
-    head, at, bus = iface.rpartition("@")  # what lies before it is a drive's mapping
+    head, at, bus = iface.rpartition("@")  # before it stands a drive's mapping
     name, _, given = bus.partition(":")
     if name not in SIMULATED:
         return iface

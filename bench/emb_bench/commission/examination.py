@@ -155,7 +155,7 @@ def identify(logs: Sequence[RunLog], sheet: Bench, noise: Noise, before: Identif
 
 
 def velocity_of(experiments: Sequence[Experiment], t_s: float) -> Velocity:
-    """Origin of the velocity in experiments with this sample time [s], of which the last tells most."""
+    """Origin of the velocity in experiments with this sample time [s], the largest experiment last."""
     found = derived(experiments[::-1], t_s)
     if found is None:
         return Velocity()

@@ -19,7 +19,7 @@ SCALE_ERROR = 0.2  # By which reported and commanded current, or angle and veloc
 LAG_ERROR = 0.05  # By which the time constant of the current loop may exceed the data sheet's
 NOISE_EXCESS = 1.1  # Noise at rest over the data sheet's, at most: 1000 samples tell a deviation to 3 %
 AT_REST = 8.0  # Standard deviations of the angle's noise within which the brake has not moved
-AT_BORDER = 0.1  # Share of a border of the data sheet within which a parameter may be what is wrong there
+AT_BORDER = 0.1  # Distance from a border of the data sheet, as a share of it, within which a parameter is suspected
 NEARLY = 1.5  # Mean square of the residuals, in variances of the noise at rest, up to which a model almost fits
 AGAIN = "and begin again in another folder"
 
@@ -101,8 +101,8 @@ class Velocity:
     """Origin of the velocity: a sensor, unless a loop that derives it from the angle has a bandwidth."""
 
     bandwidth: float = 0.0  # Of the loop that is nearest [rad/s]
-    least: float = 0.0  # Bandwidth that the loop has at least: what is declared [rad/s]
-    most: float = 0.0  # Bandwidth that it has at most [rad/s]
+    least: float = 0.0  # Least bandwidth of the loop, which is declared [rad/s]
+    most: float = 0.0  # Greatest bandwidth of the loop [rad/s]
 
     @property
     def sensors(self) -> Sensors:
@@ -131,7 +131,7 @@ class Identification:
     intervals: Mapping[str, tuple[float, float]]
     """Total (95 %) without the errors of J and of the angle's scale, which the shield shares."""
     halves: Mapping[str, tuple[float, float]]  # Repeatability and total, as shares of the value
-    model: str  # Plant of the best model, with what was added to it
+    model: str  # Plant of the best model, with the added features
     fits: bool  # The residuals do not contradict the model
     ratio: float  # Mean square of the residuals, in variances of the noise at rest
     command_delay: int  # [samples]
@@ -140,7 +140,7 @@ class Identification:
     features: Mapping[str, float]  # Features beyond eq. 3.12-3.14 that the model needed, by name [SI]
     noise: Noise  # Standard deviations of the residuals of slow motion
     velocity: Velocity = Velocity()
-    objections: tuple[str, ...] = ()  # Alarms of the tests on the residuals, and what would explain them
+    objections: tuple[str, ...] = ()  # Alarms of the tests on the residuals, and their possible causes
 
     def __str__(self) -> str:
         found = [
@@ -170,7 +170,7 @@ class Identification:
         return found
 
     def contradiction(self, sheet: Bench, names: Sequence[str]) -> str:
-        """Words for parameters that may lie outside of the data sheet's ranges, and what to do."""
+        """Words for parameters that may lie outside of the data sheet's ranges, with the remedy."""
         values = []
         for name in names:
             lowest, highest = (plain(end, 5) for end in sheet_range(sheet, name))
@@ -230,7 +230,7 @@ def sheet_range(bench: Bench, name: str) -> tuple[float, float]:
 
 
 def suspected(sheet: Bench, one: Identification | None) -> str:
-    """Words for what is wrong in a data sheet where the brake moves as none of its set does."""
+    """Words for the numbers of a data sheet to check, where no brake of its set moves as this one does."""
     others = (
         "J and gamma of [brake], at break_away, f_l, current_lag and frame_age of [shield], and whether the brake "
         "turns freely"

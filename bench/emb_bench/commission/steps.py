@@ -17,8 +17,8 @@ from emb_runtime.policy.contract import SAMPLE
 LISTENING = 4.0  # Time to listen [s]: more samples than an experiment has, whose residuals also tell the noise
 SHORT = 0.2  # Duration of the runs that move nothing [s]
 BELOW = 0.5  # Current of the check of the current, as a share of the least that could move any brake of the data sheet
-FIRST_MOVE = 1.3  # Largest current of the first move, in multiples of what moves every brake of the data sheet
-MOVES = 1.3  # Current of the free stroke, in multiples of what moved this one
+FIRST_MOVE = 1.3  # Largest current of the first move, in multiples of the one that moves every brake of the data sheet
+MOVES = 1.3  # Current of the free stroke, in multiples of the one that moved this brake
 REACH = 0.7  # Share of the upper angle limit that an experiment goes to
 FASTEST = 0.8  # Share of the speed limit that an experiment goes to
 SIGNS = (1, -1, 1, 1, -1, -1, 1, -1, -1, 1)  # of the check of the current, five samples each
@@ -39,11 +39,11 @@ EVERYWHERE = Window(-math.inf, math.inf, math.inf)
 
 @dataclass(frozen=True)
 class Step:
-    """One guarded run: what is done, and within which limits."""
+    """One guarded run: its currents and its limits."""
 
-    purpose: str  # Description of what is done, for the operator
+    purpose: str  # Description for the operator
     duration: float  # [s]
-    stage: tuple[str, ...]  # Options of ``emb-run`` for what may be sent
+    stage: tuple[str, ...]  # Options of ``emb-run`` for the currents that may be sent
     window: Window = EVERYWHERE
     currents: tuple[float, ...] = (0.0,)  # Requested current by sample [A]; after the last one it stays
 

@@ -48,7 +48,7 @@ class Budgets:
 
     @property
     def shares(self) -> dict[str, float]:
-        """Budgets by what is counted, 0..1."""
+        """Budgets of the counts, by name, 0..1."""
         return {name: value for name in COUNTED if (value := getattr(self, name)) is not None}
 
     @property

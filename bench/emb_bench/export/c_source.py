@@ -19,7 +19,7 @@ OUTPUTS = {
     "clamping_force": ("N", "clamping force"),
     "friction_torque": ("N.m", "friction torque, positive against a positive velocity"),
 }
-"""Members of the struct that are outputs, with their units and what they are."""
+"""Members of the struct that are outputs, with unit and description."""
 
 
 def part(name: str) -> str:

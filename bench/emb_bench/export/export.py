@@ -112,8 +112,8 @@ MODELS: Mapping[str, Callable[[Identified], tuple[bytes, str]]] = {
     ".dcm": lambda found: (dcm(found).encode("ascii"), "a calibration file"),
     **dict.fromkeys((".xml", ".mjcf"), _mjcf),
 }
-"""Content of a model's file, and what it is in words, by the file's ending."""
-FORMATS = (*PICTURES, *TABLES, *MODELS)  # Endings of what is written
+"""Content of a model's file, and its description, by the file's ending."""
+FORMATS = (*PICTURES, *TABLES, *MODELS)  # Endings of the files
 CYCLE = "/cycle"
 
 

@@ -34,7 +34,7 @@ _FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-s")  # r
 
 
 def fmu(found: Identified) -> tuple[bytes, str]:
-    """The FMU, and what it is in words: with a library, or why without."""
+    """The FMU, and its description in words: with a library, or the reason without one."""
     source = c_source(found)
     token = hashlib.sha256(source.encode()).hexdigest()
     inside = {

@@ -90,7 +90,7 @@ class Identified:
 
     @property
     def features(self) -> tuple[str, ...]:
-        """Names of what it has beyond the thesis's equations."""
+        """Names of its features beyond the thesis's equations."""
         usual = Mechanics()._asdict() | {"contact": 0.0, "tolerance": self.mechanics.tolerance}
         values = self.mechanics._asdict() | {"contact": self.contact}
         return tuple(name for name, value in values.items() if value != usual[name])

@@ -42,7 +42,7 @@ from emb_runtime.system.input_file import read_bytes
 
 OBSERVATIONS = 2000
 MOST_NUMBERS = 1 << 20  # Of one result inside a graph
-APART = 1e-3  # Most difference by rounding from what a graph is made of, part of the output's limit
+APART = 1e-3  # Largest difference by rounding from the source of a graph, part of the output's limit
 WIDTHS = {len(names): names for names in INPUTS}  # Inputs by their number
 PORT = f"expected {' or '.join(map(str, WIDTHS))} numbers: angle, velocity, time, or these and the running estimate"
 FLOATS = {TensorProto.FLOAT: np.float32, TensorProto.DOUBLE: np.float64, TensorProto.FLOAT16: np.float16}

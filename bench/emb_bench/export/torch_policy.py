@@ -89,7 +89,7 @@ def torch_graph(module: nn.Module, width: int) -> onnx.ModelProto:
 
 
 def _copied(module: nn.Module) -> nn.Module:
-    """The module in evaluation, in single precision, on the processor; what was given stays as it is."""
+    """The module in evaluation, in single precision, on the processor; the original stays as it is."""
     try:
         return copy.deepcopy(module).cpu().float().eval()
     except Exception as err:  # whatever its parts raise

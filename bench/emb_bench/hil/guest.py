@@ -67,7 +67,7 @@ def _mount() -> None:
 
 
 def _load_modules() -> None:
-    """Load what is there of the modules; whether it was enough is seen later."""
+    """Load the modules that are there; a missing one shows later."""
     release = os.uname().release
     for root in MODULE_ROOTS:
         found = {path.stem: path for path in Path(root, release).rglob("*.ko")}
@@ -143,7 +143,7 @@ def _run(job: dict[str, Any], state: int, out: int, err: int, status: int) -> in
 
     signal.signal(signal.SIGINT, forward)  # Ctrl-Alt-Del, by which the host makes this process look
     os.write(status, RUNNING)
-    forward(signal.SIGINT, None)  # what came during the start
+    forward(signal.SIGINT, None)  # a signal that came during the start
     while True:
         pid, result = os.wait()
         if pid == child.pid:

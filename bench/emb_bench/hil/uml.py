@@ -285,7 +285,7 @@ class KernelCommand:
         return int(last[0])
 
     def _pump(self) -> None:
-        """Copy what the command wrote since the last time, in blocks, to the caller's own descriptors."""
+        """Copy the new output of the command, in blocks, to the caller's descriptors."""
         for descriptor, stream in self._streams:
             while block := stream.read(65536):
                 while block:

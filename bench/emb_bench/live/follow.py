@@ -70,7 +70,7 @@ def _bytes_once_there(file: BinaryIO, count: int, wait: Callable[[], bool]) -> b
         if len(data) < count:
             if not goes_on:
                 return None
-            goes_on = wait()  # what came meanwhile is read once more
+            goes_on = wait()  # bytes that came meanwhile are read once more
     return data
 
 

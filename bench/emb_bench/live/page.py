@@ -44,7 +44,7 @@ class Page:
 
     @property
     def so_far(self) -> list[str]:
-        """Messages of the present log, the beginning first; without one what to do."""
+        """Messages of the present log, the beginning first; without a log, the advice."""
         return [self._first, *self._sent]
 
     def begin(self, name: str, logs: Sequence[str]) -> str:

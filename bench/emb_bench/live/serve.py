@@ -98,7 +98,7 @@ class Viewer:
                 self._news.notify()
 
     def listen(self) -> None:
-        """Take what the viewer asks for, until it leaves."""
+        """Process the requests of the viewer, until it leaves."""
         sender = threading.Thread(target=self._send)
         sender.start()
         try:

@@ -31,7 +31,7 @@ class McapReader(MessageReader):
         self.missing = self._log.missing  # Description of the missing parts; empty if there are none
 
     def __iter__(self) -> Iterator[Message]:
-        """Messages; ``timestamp`` is Unix time [s], ``is_rx`` is False for what was sent."""
+        """Messages; ``timestamp`` is Unix time [s], ``is_rx`` is False for a sent frame."""
         # Without the bus's options: python-can takes digits at the end of a channel's name for its number.
         bus = self._log.run["iface"].partition(":")[0] if "iface" in self._log.run else None
         for frame in self._log.frames_by_unix_time():

@@ -290,7 +290,7 @@ class RunLog:
 
     @property
     def drive_lacks(self) -> dict[str, str]:
-        """Properties that a mapped drive lacks, which its mapping file accepts: name and what is lost; else empty."""
+        """Properties that a mapped drive lacks, which its mapping file accepts: name and consequence; else empty."""
         names = self.metadata.get("emb.drive", {}).get("lost", "").split(", ")
         return {terminal.one_line(name): PROPERTIES.get(name, "not known to this version") for name in names if name}
 
@@ -304,7 +304,7 @@ class RunLog:
 
     @cached_property
     def drive(self) -> DriveMapping | None:
-        """The mapped drive; None for the log of any other run, or where what the log has of it is not readable."""
+        """The mapped drive; None for the log of any other run, or where its mapping in the log is not readable."""
         try:
             return None if self.drive_files is None else parse_mapping(*self.drive_files, f"{self.path}: drive.toml")
         except MappingError:
@@ -370,7 +370,7 @@ class RunLog:
         return found | ({} if drive is None or not drive.conditions else self._told_by(drive))
 
     def _told_by(self, drive: DriveMapping) -> dict[str, NDArray[np.float64]]:
-        """Conditions by the frames on the bus of a mapped drive, by name, without what cannot be believed."""
+        """Conditions by the frames on the bus of a mapped drive, by name, without implausible values."""
         found: dict[str, list[float]] = {}
         for identifier, data, *kind in self.rows("/drive/rx", "id", "data", "is_extended", "is_rtr", "is_error"):
             for name, value in conditions_in(drive, Frame(identifier, data, 0, *kind)).items():
@@ -456,7 +456,7 @@ Found = TypeVar("Found")
 
 
 def once(read: Callable[[RunLog], Found]) -> Callable[[RunLog], Found]:
-    """A function of a log that is called once for each opened log; what it gives must not be changed."""
+    """A function of a log that is called once for each opened log; its result must not be changed."""
     results: WeakKeyDictionary[RunLog, Found] = WeakKeyDictionary()
 
     @wraps(read)
@@ -548,7 +548,7 @@ def _topics(path: Path, contents: McapFile, counts: Mapping[int, int]) -> dict[s
 
 @lru_cache(maxsize=64)
 def _kinds(factory: Any) -> dict[str, str]:
-    """In words what each field becomes as a column."""
+    """Type of each field's column, in words."""
     words = {"float64": "a real number", "int64": "a whole number", "bool": "yes or no"}
     return {column.name: words.get(column.kind, column.kind) for column in describe(factory)}
 

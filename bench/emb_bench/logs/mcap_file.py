@@ -91,7 +91,7 @@ class Chunk(NamedTuple):
 
 
 class McapFile:
-    """An MCAP file that is read once, ``size`` bytes of it; what is appended meanwhile does not count."""
+    """An MCAP file that is read once, ``size`` bytes of it; bytes that are appended meanwhile do not count."""
 
     def __init__(self, path: Path, file: BinaryIO, size: int) -> None:
         self._path, self._file, self._size = path, file, size
@@ -152,14 +152,14 @@ class McapFile:
         self._require_ours()
 
     def name_missing(self, what: str) -> None:
-        """Name something that is missing; of a file that is damaged all over, only what comes first."""
+        """Name a missing part; of many parts only the first ones."""
         if len(self.missing) < MOST_NAMED:
             self.missing.append(what)
         elif len(self.missing) == MOST_NAMED:
             self.missing.append("and more is damaged")
 
     def _take(self, opcode: int, body: bytes) -> Chunk | None:
-        """Keep what a record holds; returns it if it is a chunk.
+        """Store the content of a record; returns it if it is a chunk.
 
         Raises:
             DAMAGE: it is not what it should be.
@@ -310,7 +310,7 @@ def _parse_description(opcode: int, content: bytes) -> mcap.Schema | mcap.Channe
 
 
 def stream_of(body: bytes) -> ReadDataStream:
-    """A record's body as what the ``mcap`` library reads from."""
+    """A record's body as a stream for the ``mcap`` library."""
     return ReadDataStream(io.BytesIO(body))
 
 

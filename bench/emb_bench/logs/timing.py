@@ -50,7 +50,7 @@ class Timing:
     decision: Floats  # Times from there until policy, clip and shield had answered [s]
     sending: Floats  # Times from there until the bus had taken the command [s]
     response: Floats  # Times from a sample's arrival until the bus had taken its answer [s]
-    slack: Floats  # Time to spare before the answer would have been too late for the period that it was meant for [s]
+    slack: Floats  # Time from the answer to the latest one that would still act in its period [s]
     samples: int  # Samples of the experiment
     missed: int  # Periods without a sample
     unanswered: int  # Samples that got no answer
@@ -71,7 +71,7 @@ class Timing:
 
 
 class BudgetCheck(NamedTuple):
-    """One budget and what was measured."""
+    """One budget, and the measured value."""
 
     name: str  # Interval and quantile, or share: ``response p99.9``, ``missed``
     budget: float  # [s], or a share
@@ -84,7 +84,7 @@ class BudgetCheck(NamedTuple):
 
 
 def check_budgets(t: Timing, budgets: Budgets) -> list[BudgetCheck]:
-    """Every budget beside what a run took."""
+    """Every budget beside the measured value of a run."""
     checks = [BudgetCheck(name, budgets.shares[name], t.share(name)) for name in COUNTED if name in budgets.shares]
     for name, limits in budgets.intervals.items():
         found = quantiles(t.interval(name))

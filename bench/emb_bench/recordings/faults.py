@@ -64,7 +64,7 @@ Of = TypeVar("Of")
 Found = Mapping[str, object] | None
 """Numbers and texts of a fault, by their places in its sentence; None where there is none."""
 Checks = Mapping[Callable[[Of], Found], str]
-"""The faults that are looked for: what finds each, and the sentence that names it. The first one counts most."""
+"""Tests for faults, with the sentence that names each; the most important first."""
 
 
 def found_by(checks: Checks[Of], of: Of) -> Iterator[str]:
@@ -102,7 +102,7 @@ class Series(NamedTuple):
 
 
 def _is_apart(s: Series) -> Found:
-    """A time that neither goes on from the one before nor leads to the one after it, which follow each other."""
+    """A single time that is out of order between two that are in order."""
     steps = np.diff(s.times)
     back = int(np.argmax(steps < 0.0)) if (steps < 0.0).any() else 0
     for k in (back, back + 1):  # the one before the step back is too late, or the one after it too early
@@ -295,26 +295,26 @@ class Equation:
     t_s: float  # Sample time [s]
     response: Floats  # Second differences of the angle, shape (m,)
     loads: Mapping[str, Floats]  # Regressors of friction, spring and a constant, by their parameters, shape (m,) each
-    drive: Floats  # Double integral of what acts, at each sample, shape (n + 1,)
+    drive: Floats  # Double integral of the driving current or torque, at each sample, shape (n + 1,)
     span: int  # [samples]
     complete: NDArray[np.bool_]  # Spans without a lost sample
     basis: Floats  # Orthonormal basis of the loads, shape (m, loads)
     latest: int  # Largest delay that is looked for [samples]
 
     def driven(self, delay: float) -> Floats:
-        """Double integral of what acts ``delay`` samples late, over each span."""
+        """Double integral of the drive over each span, ``delay`` samples late."""
         at = np.arange(len(self.drive), dtype=np.float64)
         return _second(np.interp(at - delay, at, self.drive), self.span)[self.complete]
 
     def correlation(self, delay: float) -> float:
-        """Partial correlation of the angle with what acts, ``delay`` samples late, beside all loads."""
+        """Partial correlation of the angle with the drive, ``delay`` samples late, given all loads."""
         response, driven = (row - self.basis @ (self.basis.T @ row) for row in (self.response, self.driven(delay)))
         size = float(np.linalg.norm(response) * np.linalg.norm(driven))
         return float(response @ driven) / size if size > 0.0 else 0.0
 
     @cached_property
     def best(self) -> tuple[float, float]:
-        """Delay of what acts with which the equation holds best [samples], and the correlation there."""
+        """Delay of the drive with the largest correlation [samples], and that correlation."""
         coarse = max(range(-self.latest, self.latest + 1), key=self.correlation)
         near = np.linspace(coarse - 1.0, coarse + 1.0, 21).tolist()
         return max(((delay, self.correlation(delay)) for delay in near), key=lambda pair: pair[1])
@@ -358,7 +358,7 @@ def _second(row: Floats, span: int) -> Floats:
 
 
 def _double(rate: Floats, t_s: float) -> Floats:
-    """Double integral at each sample of what is constant within each period."""
+    """Double integral at each sample of a rate that is constant within each period."""
     first = np.cumsum(rate) * t_s
     result: Floats = np.concatenate([[0.0], np.cumsum(first - 0.5 * rate * t_s) * t_s])
     return result

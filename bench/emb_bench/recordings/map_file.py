@@ -41,7 +41,7 @@ class Place(NamedTuple):
 
 
 class Signal(msgspec.Struct, frozen=True, kw_only=True):
-    """One signal of a recording: its column, and how it becomes ours."""
+    """One signal of a recording: its column, and the conversion to SI units."""
 
     column: str
     unit: str
@@ -101,7 +101,7 @@ class Signals(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def acting(self) -> str:
-        """Name of the signal that says what acted: the current where it was measured, else the command."""
+        """Name of the signal that drives the machine: the current where it was measured, else the command."""
         return "command" if self.current is None else "current"
 
 
@@ -122,7 +122,7 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
     rows: tuple[Row, Row] | None = None  # First and last row that counts, the one after the head being 1
 
     def __post_init__(self) -> None:
-        """Check what the types do not say."""
+        """Check the encoding and the order of the rows."""
         try:
             bytes(4).decode(self.encoding or "utf-8")  # without a byte it is not looked up
         except LookupError:
@@ -222,7 +222,7 @@ class RecordingMap(msgspec.Struct, frozen=True, kw_only=True):
     timing: Timing = Timing()
 
     def __post_init__(self) -> None:
-        """Check what the signals need of the machine."""
+        """Check that the machine has the parameters that the signals need."""
         unit, has_k_m = self.command_unit, "k_m" in self.machine.parameters
         if unit in LOADS and (has_k_m or self.signals.current is not None):
             raise FieldError("signals.command.unit", f"a command in {unit} has no k_m and no current: its k_m is 1")
@@ -231,7 +231,7 @@ class RecordingMap(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def command_unit(self) -> str:
-        """Unit of what was commanded, or of the current where only that was measured."""
+        """Unit of the command, or of the current where only that was measured."""
         return "A" if self.signals.command is None else self.signals.command.unit
 
     @property

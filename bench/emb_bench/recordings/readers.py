@@ -86,7 +86,7 @@ def _errors_in_one_line(path: Path, kind: str) -> Iterator[None]:
             yield
     except EmbError:
         raise
-    except Exception as err:  # every library has errors of its own, and some raise whatever they meet
+    except Exception as err:  # the errors of these libraries share no base class
         _let_go(err)
         message = " ".join(str(err).split())[:120] or type(err).__name__
         raise UsageError(f"{path}: not readable as {kind}: {message}") from err
@@ -305,7 +305,7 @@ def _matlab(path: Path, places: Sequence[Place]) -> Iterator[Read]:
 
 
 def _inside(name: str, value: Any) -> Iterator[str]:
-    """Names of what a variable of MATLAB has inside."""
+    """Names of the fields and columns inside a variable of MATLAB."""
     if isinstance(value, Mapping):
         for key, inner in value.items():
             yield from _inside(f"{name}.{key}", inner)
@@ -403,7 +403,7 @@ def _decoded(message: Any, data: Any) -> Mapping[str, Any] | None:
     """Values of a frame; None if it does not fit the DBC."""
     try:
         found: Mapping[str, Any] = message.decode(bytes(data), decode_choices=False)
-    except Exception:  # of several kinds, by what does not fit
+    except Exception:  # cantools raises several kinds
         return None
     return found
 

@@ -1,4 +1,4 @@
-"""Columns of a recording as an experiment in our units, on a grid of times, and what it lacks."""
+"""Columns of a recording as an experiment in SI units, on a grid of times, and the list of what it lacks."""
 
 from __future__ import annotations
 
