@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from emb_runtime.safety.shield import PAST, _braking_window, _highest_current
+from emb_runtime.safety.shield import PAST, _highest_current, braking_window
 from emb_runtime.safety.shield_design import ANGLE_PAD, ShieldLaw, damped_excess, unseen
 from proof.boxes import Covered, Slack, cover
 from proof.cases import Case
@@ -37,7 +37,7 @@ def some_current_is_left(case: Case) -> Covered:
             ends.append(plain(*args))
             return ends[-1]
 
-        window = boxes.lift(_braking_window, _highest_current=watched)
+        window = boxes.lift(braking_window, _highest_current=watched)
 
         def slack(angle: Interval, velocity: Interval) -> Any:
             # Older measurements, and those of an observer, leave wider boxes.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from emb_runtime.safety.shield import _braking_window, _highest_current, successor
+from emb_runtime.safety.shield import _highest_current, braking_window, successor
 from emb_runtime.safety.shield_design import stoppable
 from proof.cases import Case
 from proof.successors import any_box
@@ -31,7 +31,7 @@ def _kept(facts: Facts, case: Case, end: int) -> None:
         ends.append(plain(*args) if len(ends) == end else facts.constant(0.0))
         return ends[-1]
 
-    window = facts.lift(_braking_window, stoppable=facts.stand_in(-1.0, asked), _highest_current=watched)
+    window = facts.lift(braking_window, stoppable=facts.stand_in(-1.0, asked), _highest_current=watched)
     lowest, highest = window(law, xl, xh, vl, vh)
     allowed, room, speed, braking, sampled = asked[end]
     facts.claim("sampled", sampled, law.sample_time)

@@ -24,6 +24,7 @@ import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from os import _exit
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -796,7 +797,7 @@ def _become(program: Callable[[list[str]], int], arguments: list[str], output: i
         sys.stdout.flush()
         sys.stderr.flush()
     finally:
-        os._exit(code)
+        _exit(code)
 
 
 def _wait(pid: int, longest: float) -> tuple[int, resource.struct_rusage]:

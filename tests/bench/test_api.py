@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,7 @@ from matplotlib.figure import Figure
 from numpy.testing import assert_array_equal
 
 from emb_bench import api
-from emb_bench.cli import design, replay
-from emb_bench.information.evaluation import Evaluation
+from emb_bench.cli import replay
 from emb_runtime.cli import main as emb_run
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import UsageError
@@ -68,51 +66,6 @@ def test_nothing_that_is_handed_on_says_where_its_user_keeps_files(
     assert [text for text in said if "own/" in text or str(tmp_path) in text] == []
 
 
-def test_fisher_information_is_that_of_emb_replay_fim(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["fim", str(log), "--json", "--model", "lag", "--params", "k_1,f_v", "--nuisance", "delay"]
-    command += ["--prior", "pm50", "--theta", "f_v=3e-5"]
-    found = printed(capsys, replay.main(command))
-    e = api.fisher_information(
-        api.open_run(log), model="lag", params=("k_1", "f_v"), nuisance=["delay"], prior="pm50", theta={"f_v": 3e-5}
-    )
-    assert isinstance(e, Evaluation)
-    assert e.plant.name == found["model"] == "lag"
-    assert [e.fit.angle, e.fit.velocity] == [found["fit_sigmas"]["angle"], found["fit_sigmas"]["velocity"]]
-    for kind in ("physical", "weighted"):
-        assert e.fisher(kind).matrix.tolist() == found[kind]["matrix"]
-    assert e.fisher("physical").cramer_rao() == found["physical"]["cramer_rao"]
-
-
-def test_an_estimate_is_that_of_emb_replay_estimate(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = printed(capsys, replay.main(["estimate", str(log), "--json", "--params", "k_1,f_v", "--starts", "2"]))
-    study = api.estimate(api.open_run(log), params=("k_1", "f_v"), starts=2)
-    assert study.estimate.theta._asdict() == found["theta"]
-    assert study.model_fits == found["model_fits"] is True
-    assert [c.interval for c in study.conclusions] == [
-        tuple(found["parameters"][name]["interval_95"]) for name in ("k_1", "f_v")
-    ]
-
-
-def test_a_design_is_that_of_emb_design(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    short = tmp_path / "short.toml"
-    text = shipped_bench_text().replace("horizon     = 500", "horizon     = 50")
-    short.write_text(text, encoding="utf-8")
-    options = ["--criterion", "A", "--params", "k_m,T_c", "--theta", "f_v=3e-5", "--starts", "1", "--seed", "3"]
-    options += ["--bench", str(short), "--model", "euler", "--no-return-home", "--json"]
-    found = printed(capsys, design.main(options))
-    report = api.design(
-        criterion="A",
-        params=("k_m", "T_c"),
-        theta={"f_v": 3e-5},
-        starts=1,
-        seed=3,
-        bench=short,
-        model="euler",
-        return_home=False,
-    )
-    assert json.loads(report.json()) == found
-
-
 def test_a_log_s_bench_is_replaced_by_one_of_the_same_sample_time_only(log: Path, tmp_path: Path) -> None:
     text = api.open_run(log).bench.text
     same, slower = tmp_path / "same.toml", tmp_path / "slower.toml"
@@ -126,41 +79,6 @@ def test_a_log_s_bench_is_replaced_by_one_of_the_same_sample_time_only(log: Path
         api.estimate([])
     with pytest.raises(UsageError, match="sample time"):
         api.fisher_information(run, bench=slower)
-
-
-def test_what_a_user_tries_first_works(log: Path, tmp_path: Path) -> None:
-    run, information = api.open_run(str(log)), api.fisher_information(log, params="f_v")
-    study = api.estimate(str(log), params="f_v", starts=1)
-    second = api.simulate(tmp_path / "second.mcap", parameters={"f_v": 3e-5}, seed=3)
-    both = api.estimate([log, second], params=["f_v"], starts=1)
-    natural: dict[str, bool] = {
-        "run.exit_reason": run.exit_reason == "DONE",
-        "run.truth": run.truth is not None and run.truth.f_v == 3e-5,
-        "run.bench": run.bench.name.startswith("drum brake"),
-        "run['/cycle']": run["/cycle"]["angle"].max() > 10.0,
-        "run.cycles": run.cycles["angle"].max() > 10.0,
-        "run.to_dataframe()": run.to_dataframe()["angle"].max() > 10.0,
-        "run.to_dataframe(topic)": "f_v_deviation" in run.to_dataframe("/estimate").columns,
-        "run.plot()": len(run.plot().axes) == 5,
-        "api.topic(path, name)": api.topic(log, "/estimate").num_rows == len(run["/estimate"]["f_v"]),
-        "information['f_v']": 0.0 < information["f_v"] < 1e-3,
-        "api.fisher_information(run, params='k_m,f_v')": api.fisher_information(run, params="k_m,f_v")["k_m"] > 0.0,
-        "study['f_v'].value": study["f_v"].value == pytest.approx(3e-5, rel=1e-3),
-        "study['f_v'].interval": study["f_v"].interval[0] < 3e-5 < study["f_v"].interval[1],
-        "study['f_v'].unit": study["f_v"].unit == "N·m·s/rad",
-        "'f_v' in study": "f_v" in study and "k_m" not in study,
-        "for c in study": [c.label for c in study] == ["f_v"],
-        "len(study)": len(study) == 1,
-        "study.model_fits": study.model_fits,
-        "study.to_dataframe()": study.to_dataframe().loc["f_v", "value"] == study["f_v"].value,
-        "study.to_dict()": study.to_dict()["f_v"]["value"] == study["f_v"].value,
-        "pickle.loads(pickle.dumps(study))": pickle.loads(pickle.dumps(study)).to_dict() == study.to_dict(),
-        "study.plot()": "f_v" in study.plot().axes[0].get_yticklabels()[0].get_text(),
-        "study._repr_html_()": study._repr_html_().count("<tr>") == 2,
-        "api.estimate([path, run])": len(both.logs) == 2,
-        "api.report(path, 'page.html')": api.report(log, tmp_path / "page.html", params="f_v", starts=1) is not None,
-    }
-    assert not [call for call, works in natural.items() if not works]
 
 
 def test_a_topic_is_the_table_that_emb_replay_export_writes(log: Path, tmp_path: Path) -> None:

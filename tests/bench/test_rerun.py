@@ -38,7 +38,7 @@ from tests.conftest import FunctionActor
 
 Law = Callable[[float, float, float], float]
 NOT_PLAYED = {"unguarded"}  # Its guard is not carried by a log
-OF_A_WAY_HOME = {"not_home", "pushed_before"}
+OF_A_WAY_HOME = {"not_home", "turned_out"}
 Again = Callable[..., Rerun]
 
 
@@ -265,18 +265,6 @@ def test_a_log_that_was_cut_anywhere_is_followed_up_to_there(hostile: Callable[.
         assert result.decisions == len(cut.journal.cycles)
 
 
-def test_a_file_that_was_cut_says_so_and_is_no_failure(
-    tmp_path: Path, with_policy: Callable[..., list[str]], replay: Replay
-) -> None:
-    whole = Path(with_policy(flush_every=100)[1])
-    cut = tmp_path / "cut.mcap"
-    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
-    out = replay.text("rerun", cut)
-    assert out.startswith("WARNING: the file is cut")
-    assert "reproduced   each of" in out
-    assert "the log ends before the run does" in out
-
-
 # --- what was altered is found --------------------------------------------------------------------------------------
 
 NUMBERS = ("angle", "velocity", "applied_current", "policy_current", "clipped_current", "sent_current")
@@ -492,12 +480,6 @@ def test_a_policy_in_a_log_is_refused_as_emb_run_refuses_it(
 ) -> None:
     for policy in (b"no actor", constant_actor(bench, 2.0)[:-50], constant_actor(bench, sample_time=2e-3)):
         replay.refused(*with_policy(policy=policy), code=5)
-
-
-def test_a_log_without_the_beginning_of_its_run_is_one_line(
-    with_policy: Callable[..., list[str]], replay: Replay
-) -> None:
-    assert "beginning of the run" in replay.refused(*with_policy(lambda records: records.pop(0)), code=6)
 
 
 def test_a_log_without_the_inputs_of_its_run_is_one_line(with_policy: Callable[..., list[str]], replay: Replay) -> None:

@@ -30,6 +30,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from os import _exit
 from pathlib import Path
 from types import CodeType, FrameType, FunctionType, ModuleType
 
@@ -203,7 +204,7 @@ class _UntilFailure:
         self.durations[report.nodeid] = self.durations.get(report.nodeid, 0.0) + report.duration
         if report.failed:
             self.tell(report.nodeid)
-            os._exit(1)  # what pytest and the interpreter do at their end takes longer than many a test
+            _exit(1)  # what pytest and the interpreter do at their end takes longer than many a test
 
     def tell(self, failed: str) -> None:
         with os.fdopen(self.writer, "w") as pipe:
@@ -362,7 +363,7 @@ def _child(so_far: Experience, where: str, run: Callable[[_UntilFailure], int], 
         code = run(plugin)
         plugin.tell("")
     finally:
-        os._exit(code)
+        _exit(code)
 
 
 def path_of(module: str) -> Path:

@@ -178,8 +178,8 @@ BROKEN_FUNCTIONS = [
     ("L2a", "stoppable", "rest = room - ts * v", "rest = room"),
     ("L2b", "_highest_current", "box.motor_high if drive > 0.0 else box.motor_low", "box.motor_low"),
     ("L2b", "_highest_current", "jumping if jumping < drive else drive", "drive"),
-    ("L2b", "_braking_window", "- VELOCITY_PAD\n    bottom", "\n    bottom"),
-    ("L2b", "_braking_window", "law.top - xh", "law.top - xl"),
+    ("L2b", "braking_window", "- VELOCITY_PAD\n    bottom", "\n    bottom"),
+    ("L2b", "braking_window", "law.top - xh", "law.top - xl"),
     ("L3b", "damped_current", "-limit * velocity", "-0.99 * limit * velocity"),
     ("L4a", "damped_excess", "+ 0.5 * v * sample_time", "- 0.5 * v * sample_time"),
     ("L9b", "_rolled", "vh + law.change", "vh"),
@@ -305,7 +305,7 @@ def test_rounding_moves_an_end_of_the_window_by_less_than_a_billionth_of_an_ampe
     widest = 0.0
 
     def statement(boxes: Boxes) -> Any:
-        window = boxes.lift(shield_module._braking_window)
+        window = boxes.lift(shield_module.braking_window)
         law = interval_law(boxes, SHIPPED.law)
 
         def width(x: Any, v: Any) -> Any:
@@ -364,7 +364,7 @@ WITH_SELECTIONS = {
     "fastest_next": 3,
     "successor": 5,
     "_accelerated": 5,
-    "_braking_window": 4,
+    "braking_window": 4,
     "_arrival": 2,
     "shield": 8,
 }

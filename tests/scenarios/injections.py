@@ -83,10 +83,6 @@ def moved_unseen(move: Callable[[SimTransport], object]) -> Receive:
     return receive
 
 
-def push(transport: SimTransport) -> None:
-    transport.node.angle, transport.node.velocity = -4.0, -450.0
-
-
 def away(transport: SimTransport) -> None:
     transport.node.angle = 2.0
 
@@ -100,6 +96,12 @@ def nothing(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -
 def drift(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
     late = max(transport.node.periods - 100, 0)
     return frame and saying(Angle=lambda angle: angle + 0.03 * late)(frame)
+
+
+def turned_out(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
+    """A hand turns the brake slowly, beyond its lower limit as the way home begins."""
+    transport.node.angle = -9.95 - 0.004 * transport.node.periods
+    return frame
 
 
 def stop(transport: SimTransport) -> None:

@@ -37,11 +37,11 @@ from tests.scenarios.injections import (
     later,
     moved_unseen,
     nothing,
-    push,
     reported,
     saying,
     shortened,
     stop,
+    turned_out,
 )
 
 Action = dict[str, Any]  # Done in the kernel by the method of tests.hil.stage that ``do`` names
@@ -170,8 +170,8 @@ SCENARIOS = (
         lambda run: run(on_receive=dropping(ANGLE, range(100, 10_000))),
     ),
     Scenario(
-        "pushed_before", "a push before the way home, faster than any may be", ("OUT_OF_LIMITS",),
-        lambda run: run(homing=True, on_receive=moved_unseen(push)),
+        "turned_out", "a hand turns the brake out of its limits as the way home begins", ("OUT_OF_LIMITS",),
+        lambda run: run(homing=True, angle=-9.95, on_receive=turned_out),
     ),
     Scenario(
         "drift", "the angle drifts beside the velocity", ("SENSORS_CONTRADICT",), lambda run: run(on_receive=drift),

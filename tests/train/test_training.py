@@ -222,14 +222,17 @@ def test_ctrl_c_and_divergence_leave_the_best_actor_so_far(
         assert policy_of(folder)["score"] == max(scores)
 
 
-def test_training_validation_and_evaluation_draw_other_brakes(finished: Path) -> None:
+def test_training_validation_and_evaluation_draw_other_brakes(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Any] = []
+    environments = Training.environments
+    monkeypatch.setattr(Training, "environments", lambda *of: made.append(environments(*of)) or made[-1])
     bench, f_v = load_bench(finished / BENCH), BrakeParameters._fields.index("f_v")
     ranges, actor = bench.range_set("viscous"), tiny().untrained_actor(bench)
     drawn: list[float] = []
     for seed in range(20):
         validation = Validation(tiny(seed=seed), bench)
         validation.score(actor)
-        drawn += validation._envs[0].batch.experiments.brakes[:, f_v].tolist()
+        drawn += made[-1][0].batch.experiments.brakes[:, f_v].tolist()
         drawn += [draw.brake.f_v for draw in fresh_draws(ranges, seed, 50)]
         for iteration in range(5):  # as emb_train.ppo draws its seeds
             seeds = np.random.SeedSequence([seed, iteration]).generate_state(10, np.uint64).tolist()

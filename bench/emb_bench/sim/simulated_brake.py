@@ -101,12 +101,8 @@ class SimulatedBrake:
 
     @property
     def velocity(self) -> float:
-        """True velocity [rad/s]; it can be set, as by a push."""
+        """True velocity [rad/s]."""
         return float(self._x[1])
-
-    @velocity.setter
-    def velocity(self, velocity: float) -> None:
-        self._x[1] = velocity
 
     def _delayed(self, asked: float) -> float:
         """Current that acts in the coming period where ``asked`` is ordered [A]; NaN stands for none, in both."""

@@ -110,7 +110,7 @@ def _window_and_box(
         elif law.delay.lag > 0.0:
             bottom, top = _lagging_window(law, xl, xh, vl, vh, past)
         else:
-            bottom, top = _braking_window(law, xl, xh, vl, vh)
+            bottom, top = braking_window(law, xl, xh, vl, vh)
         highest = top if top < highest else highest
         lowest = bottom if bottom > lowest else lowest
         xl, xh, vl, vh = obeyed
@@ -133,7 +133,7 @@ def _decayed(law: ShieldLaw, vl: float, vh: float, past: Past) -> tuple[float, f
     return vl, vh
 
 
-def _braking_window(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float) -> tuple[float, float]:
+def braking_window(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float) -> tuple[float, float]:
     """The window for a box of states, each end cut at full braking (L2-L4 in ``docs/explanation/shield.md``)."""
     ts, box, limit, spring = law.sample_time, law.box, law.current, law.box.spring_low
     nearest, farthest = xl - law.reach, xh + law.reach

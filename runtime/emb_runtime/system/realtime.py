@@ -35,7 +35,7 @@ def obtain(priority: int = PRIORITY) -> dict[str, str]:
         "timer_slack": _set(_PR_SET_TIMERSLACK, "1 ns"),
         # The kernel joins small pages to huge ones at ordinary priority; whoever touches one meanwhile waits for it.
         "huge_pages": _set(_PR_SET_THP_DISABLE, "none are made"),
-        "idle_states": stay_awake(),
+        "idle_states": _stay_awake(),
         "memory_lock": _lock_memory(),
         "scheduler": _fifo(priority),
     }
@@ -48,7 +48,7 @@ def step_back() -> None:
             action()
 
 
-def stay_awake() -> str:
+def _stay_awake() -> str:
     """Ask that no processor may sleep until this process ends; what was obtained."""
     global _awake
     try:

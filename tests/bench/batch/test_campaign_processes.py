@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
+from os import _exit
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ def dying(log: Source) -> Row:
     if log.log.startswith("SIG"):
         os.kill(os.getpid(), signal.Signals[log.log.partition("-")[0]])
     if log.log.startswith("exit"):
-        os._exit(int(log.log[4:]))
+        _exit(int(log.log[4:]))
     if log.log == "hang":
         signal.pause()
     return {"log": log.log, "error": None, "exit_reason": " ".join(os.environ[name] for name in sorted(ONE_THREAD))}
@@ -75,7 +76,7 @@ class Fatal:
         self.code = code
 
     def __reduce__(self) -> tuple[object, ...]:
-        return os._exit, (self.code,)
+        return _exit, (self.code,)
 
     def __call__(self, _: object) -> None:
         """Work."""

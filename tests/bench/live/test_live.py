@@ -11,12 +11,14 @@ import socket
 import struct
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -30,7 +32,16 @@ from websockets.sync.client import ClientConnection, connect
 
 from emb_bench.live.follow import NewLogs, chunks, follow
 from emb_bench.live.page import SUBPROTOCOL
-from emb_bench.live.serve import BACKLOG, LARGEST_REQUEST, MOST_TEXTS, MOST_VIEWERS, MOST_WAITING, Server, Viewer
+from emb_bench.live.serve import (
+    BACKLOG,
+    LARGEST_REQUEST,
+    MESSAGE,
+    MOST_TEXTS,
+    MOST_VIEWERS,
+    MOST_WAITING,
+    Server,
+    Viewer,
+)
 from emb_bench.logs.log import read_log
 from emb_bench.logs.mcap_file import HEADER, Chunk
 from emb_runtime.cli import main as emb_run
@@ -191,12 +202,11 @@ def subscribe_to_everything(viewer: ClientConnection, topics: set[str]) -> dict[
     return found
 
 
-def subscribed(server: Server, channels: int) -> None:
-    """Wait until the one viewer has subscribed to so many channels."""
-    deadline = time.monotonic() + SECONDS
-    while [len(viewer._subscriptions) for viewer in server._viewers] != [channels]:
-        assert time.monotonic() < deadline
-        time.sleep(0.001)
+def subscribed(viewer: ClientConnection) -> None:
+    """Wait until what a viewer asked for is taken: it is told, in its turn, that a channel does not exist."""
+    viewer.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": 9999, "channelId": 9999}]}))
+    while json.loads(viewer.recv(SECONDS)).get("message") != "no channel is numbered 9999":
+        pass
 
 
 def test_a_viewer_gets_every_message_over_the_foxglove_protocol(shipped: Path) -> None:
@@ -210,7 +220,7 @@ def test_a_viewer_gets_every_message_over_the_foxglove_protocol(shipped: Path) -
             for chunk in rest:
                 server.add(chunk)
             topics = subscribe_to_everything(viewer, topics_of(shipped))
-            subscribed(server, len(topics))
+            subscribed(viewer)
             server.begin()
             for chunk in chunks(shipped, never):  # the same topics once more: they keep their channels
                 server.add(chunk)
@@ -376,7 +386,7 @@ def test_a_client_that_does_not_speak_the_protocol_is_left_and_the_others_stay(s
         viewer.send(b"what is binary is passed over")
         topics = subscribe_to_everything_once_served(server, viewer, shipped)
         viewer.send(json.dumps({"op": "unsubscribe", "subscriptionIds": [*topics]}))
-        subscribed(server, 0)
+        subscribed(viewer)
         server.add(next(iter(chunks(shipped, never))))
         with pytest.raises(TimeoutError):
             viewer.recv(0.1)
@@ -469,13 +479,12 @@ def test_the_address_that_is_named_is_listened_at_and_no_other(
 
 def test_a_viewer_may_subscribe_to_what_is_advertised_and_nothing_else(server: Server, shipped: Path) -> None:
     with connect(server.address, subprotocols=PROTOCOL) as viewer:
-        topics = subscribe_to_everything_once_served(server, viewer, shipped)
+        subscribe_to_everything_once_served(server, viewer, shipped)
         many = [{"id": number, "channelId": number} for number in range(1000, 2000)]
         for _ in range(50):
             viewer.send(json.dumps({"op": "subscribe", "subscriptions": many}))
             said = json.loads(viewer.recv(SECONDS))
             assert said == {"op": "status", "level": 2, "message": "no channel is numbered 1000"}
-        subscribed(server, len(topics))
         viewer.send("x" * (LARGEST_REQUEST + 1))
         with pytest.raises(ConnectionClosed, match="1009"):
             viewer.recv(SECONDS)
@@ -492,17 +501,60 @@ def test_one_viewer_too_many_is_told_so_and_the_others_stay(server: Server) -> N
         viewers[0].ping().wait(SECONDS)
 
 
-def test_what_waits_for_a_slow_viewer_is_bounded() -> None:
-    slow = Viewer(cast("Any", None), cast("Any", None))
-    slow._subscriptions = {1: 7}
-    for size, most in ((10, BACKLOG), (MOST_WAITING // 4, 4)):
-        for _ in range(BACKLOG + 10 if size == 10 else 20):
-            slow.log(1, 0, bytes(size))
-        assert len(slow._messages) == most
+class Slow:
+    """A connection that asks for channels 1 and 2, and reads when it is let."""
+
+    def __init__(self) -> None:
+        self.sending, self.reads, self.left = (threading.Event() for _ in range(3))
+        self.received: list[str | bytes] = []
+        self.reason = ""
+
+    def __iter__(self) -> Iterator[str]:
+        yield json.dumps({"op": "subscribe", "subscriptions": [{"id": n + 6, "channelId": n} for n in (1, 2)]})
+        self.left.wait(SECONDS)
+
+    def send(self, what: str | bytes) -> None:
+        self.sending.set()
+        assert self.reads.wait(SECONDS)
+        self.received.append(what)
+
+    def close(self, _: int = 0, reason: str = "") -> None:
+        self.reason = self.reason or reason
+        self.left.set()
+
+
+@pytest.mark.parametrize(
+    ("messages", "size", "waiting"), [(BACKLOG + 10, 10, BACKLOG), (20, MOST_WAITING // 4, 4)], ids=["many", "large"]
+)
+def test_what_waits_for_a_slow_viewer_is_bounded(messages: int, size: int, waiting: int) -> None:
+    slow, served = Slow(), SimpleNamespace(advertised={1})
+    viewer = Viewer(cast("Any", slow), cast("Any", served))
+    listening = threading.Thread(target=viewer.listen)
+    listening.start()
+    assert slow.sending.wait(SECONDS)  # channel 2 does not exist: it is told so, and does not read
+    served.advertised.add(2)
+    for _ in range(messages):
+        viewer.log(1, 0, bytes(size))
+        viewer.log(2, 0, bytes(size))  # what did not exist is not subscribed to when it does
+    slow.reads.set()
+    while len(slow.received) < 1 + waiting and listening.is_alive():
+        time.sleep(0.001)
+    slow.left.set()
+    listening.join(SECONDS)
+    assert Counter(len(received) for received in slow.received[1:]) == {MESSAGE.size + size: waiting}
+
+
+def test_a_viewer_that_reads_no_text_is_left() -> None:
+    slow = Slow()
+    viewer = Viewer(cast("Any", slow), cast("Any", SimpleNamespace(advertised=set())))
+    listening = threading.Thread(target=viewer.listen)
+    listening.start()
+    assert slow.sending.wait(SECONDS)
     for _ in range(2 * MOST_TEXTS):
-        slow.say(op="status")
-    assert len(slow._texts) == MOST_TEXTS + 1
-    assert not slow._open  # it is left
+        viewer.say(op="status")
+    slow.reads.set()
+    listening.join(SECONDS)
+    assert (len(slow.received), slow.reason) == (1, "too slow: load the page again")
 
 
 def test_without_the_library_the_server_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
