@@ -8,8 +8,6 @@ import json
 import math
 import os
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -104,12 +102,6 @@ def read(path: Path) -> dict[str, dict[str, Any]]:
 
 def finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-def test_every_log_is_one_row_in_sorted_order(folder: Path, said: Said) -> None:
-    assert list(said.rows) == sorted((*BROKEN, *GOOD))
-    assert {row["root"] for row in said.rows.values()} == {str(folder)}
-    assert {row["campaign"] for row in said.rows.values()} == {"broken", "monday", "tuesday", "friday"}
 
 
 def test_broken_logs_fail_with_the_words_of_the_command_for_one_log(folder: Path, said: Said, replay: Replay) -> None:
@@ -216,11 +208,6 @@ def test_one_process_gives_the_same_bytes_as_two(
     assert one.document | {"result": ""} == said.document | {"result": ""}
 
 
-def test_a_number_that_is_not_the_same_in_all_runs_is_named(said: Said) -> None:
-    found = {name: p["estimate"]["constancy"]["constant"] for name, p in said.document["parameters"].items()}
-    assert found == {"k_m": True, "k_1": True, "T_c": False, "f_v": False}
-
-
 def test_information_alone_estimates_nothing(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, replay: Replay
 ) -> None:
@@ -238,15 +225,6 @@ def test_information_alone_estimates_nothing(
     assert (row["fits"], row["f_v_estimate"], row["f_v_true"]) == (None, None, 3e-5)
     assert "T_c_cramer_rao" not in row
     assert not any(p["estimate"] for p in found.document["parameters"].values())
-
-
-def test_a_campaign_of_broken_logs_writes_why_and_exits_with_6(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path, logs = tmp_path / "r.parquet", [str(folder / log) for log in BROKEN]
-    assert main(["campaign", *logs, "-o", str(path), "--jobs", "1", "--method", "none"]) == 6
-    assert capsys.readouterr().out.startswith("6 of 6 logs FAILED\n")
-    assert [row["error"] is None for row in read(path).values()] == [False] * 6
 
 
 def test_a_log_of_another_sample_time_than_the_bench_fails_with_what_is_known_of_it(folder: Path, bench: Bench) -> None:
@@ -288,18 +266,3 @@ def test_samples_beyond_a_limit_are_counted(folder: Path, bench: Bench) -> None:
     its = parse_bench(narrow, "narrow", analysis=True)
     row = evaluate_one(Source(str(path), "", "a.mcap", "."), CampaignOptions(method="none"), its)
     assert (row["error"], row["violations"]) == (None, 7)
-
-
-@pytest.mark.parametrize("missing", ["scipy", "numba", "pyarrow"])
-def test_a_missing_extra_is_named_in_one_line(folder: Path, tmp_path: Path, missing: str) -> None:
-    code = (
-        "import sys\n"
-        f"sys.modules[{missing!r}] = None\n"
-        "from emb_bench.cli.replay import main\n"
-        f"sys.exit(main(['campaign', {str(folder / 'monday')!r}, '-o', {str(tmp_path / 'r.csv')!r}]))"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
-    assert result.returncode == 2
-    (said,) = result.stderr.splitlines()
-    assert said.startswith(f"emb-replay: a campaign needs {missing}: ")
-    assert "'.[bench]'" in said

@@ -143,8 +143,12 @@ def test_a_missing_library_is_named_with_what_to_install(
     (tmp_path / "1.mcap").touch()
     monkeypatch.setitem(sys.modules, "ray", None)
     assert "'.[ray]'" in replay.refused("campaign", tmp_path, "-o", tmp_path / "r.parquet", "--ray", "local")
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    assert "'.[bench]'" in replay.refused("campaign", tmp_path, "-o", tmp_path / "r.parquet")
+    for name in ("scipy", "numba", "pyarrow"):
+        with monkeypatch.context() as without:
+            without.setitem(sys.modules, name, None)
+            said = replay.refused("campaign", tmp_path, "-o", tmp_path / "r.parquet")
+        assert f"a campaign needs {name}: " in said
+        assert "'.[bench]'" in said
 
 
 def test_a_run_counts_once_and_the_whole_log_or_the_one_that_holds_most_of_it_is_the_one() -> None:

@@ -148,25 +148,6 @@ def test_trajectories_are_those_of_a_general_integrator_with_events() -> None:
     assert all(happened[kind] > 3 for kind in ("reversed", "stuck", "released", "contact_made", "contact_left"))
 
 
-def test_in_contact_it_is_the_damped_oscillator_of_the_textbook() -> None:
-    # Forward from 5 rad until it first stops: x = x_e + e^(-δ t) (A cos ω t + B sin ω t).
-    u, x0 = 2.0, (5.0, 100.0)
-    spring, delta = BRAKE.gamma * BRAKE.k_1, BRAKE.f_v / (2.0 * BRAKE.J)
-    omega = math.sqrt(spring / BRAKE.J - delta**2)
-    middle = (BRAKE.k_m * u - BRAKE.T_c) / spring
-    a = x0[0] - middle
-    b = (x0[1] + delta * a) / omega
-    t = np.arange(120) * T_S
-    closed = middle + np.exp(-delta * t) * (a * np.cos(omega * t) + b * np.sin(omega * t))
-    speed = np.exp(-delta * t) * (
-        (b * omega - delta * a) * np.cos(omega * t) - (a * omega + delta * b) * np.sin(omega * t)
-    )
-    assert (speed > 0.0).all()
-    states = moved(EXACT, BRAKE, np.full(119, u), x0)
-    np.testing.assert_allclose(states, np.stack([closed, speed], axis=1), rtol=1e-11)
-    assert delta / math.sqrt(spring / BRAKE.J) == pytest.approx(0.2407, abs=5e-5)  # the thesis's ζ
-
-
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(cases())
 def test_the_instants_of_all_events_of_a_period_are_found_by_few_evaluations_of_the_series(case: Case) -> None:

@@ -103,19 +103,6 @@ def test_a_file_that_is_no_design_of_the_bench_is_refused(short: Path, tmp_path:
         read_design(tmp_path / "none.csv", bench)
 
 
-def test_the_csv_says_the_same_as_the_json(short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "design.csv"
-    arguments = ["--bench", str(short), *QUICK, "--criterion", "A", "--json", "--no-return-home"]
-    assert main([*arguments, "--output", str(out)]) == 0
-    printed = json.loads(capsys.readouterr().out)
-    first, *rest = out.read_text(encoding="utf-8").splitlines()
-    assert json.loads(first.removeprefix("# ")) == printed
-    rows = list(csv.DictReader(rest))
-    assert max(abs(float(row["current"])) for row in rows) <= 6.0
-    assert (printed["criterion"], printed["returns"]) == ("A", False)
-    assert printed["value"] == pytest.approx(sum(bound**2 for bound in printed["cramer_rao"].values()), rel=1e-6)
-
-
 def test_ctrl_c_writes_the_best_design_so_far(
     short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 import os
 import re
 import subprocess
@@ -70,15 +69,6 @@ def test_information_over_time_grows_to_that_of_the_whole(path: Path, replay: Re
         assert series["lambda_min"][-1] == pytest.approx(got[kind]["lambda_min"], rel=1e-12)
 
 
-def test_the_model_is_the_plant_that_was_simulated_unless_another_is_asked_for(log: Log, replay: Replay) -> None:
-    path = log("exact.mcap", "plant=exact")
-    own = replay.document("fim", path, "--theta", "nominal")
-    assert own == replay.document("fim", path, "--theta", "nominal", "--model", "exact")
-    assert own["warnings"] == []
-    other = replay.document("fim", path, "--theta", "nominal", "--model", "euler")
-    assert (other["model"], other["fit_sigmas"]["fits"], len(other["warnings"])) == ("euler", False, 1)
-
-
 def test_a_log_that_does_not_say_what_moved_is_evaluated_with_the_brake_that_sticks(
     tmp_path: Path, run: SimRun, replay: Replay
 ) -> None:
@@ -89,34 +79,8 @@ def test_a_log_that_does_not_say_what_moved_is_evaluated_with_the_brake_that_sti
     assert replay.document("fim", old)["model"] == "euler"
 
 
-def test_nuisances_cost_information_and_a_prior_gives_some(log: Log, replay: Replay) -> None:
-    path = log("exact.mcap", "plant=exact")
-    alone = replay.document("fim", path, "--theta", "nominal")
-    nuisances = ("delay", "offset", "x1_0")
-    along = replay.document("fim", path, "--theta", "nominal", "--nuisance", ",".join(nuisances))
-    assert along["nuisances"] == list(nuisances)
-    whole = np.array(along["physical"]["matrix"])
-    np.testing.assert_allclose(whole[:4, :4], alone["physical"]["matrix"])
-    schur = whole[:4, :4] - whole[:4, 4:] @ np.linalg.solve(whole[4:, 4:], whole[4:, :4])
-    assert along["physical"]["log_det"] == pytest.approx(np.linalg.slogdet(schur)[1], rel=1e-6)
-    assert along["physical"]["log_det"] < alone["physical"]["log_det"]
-    for name, bound in alone["physical"]["cramer_rao"].items():
-        assert bound < along["physical"]["cramer_rao"][name]
-    inertia = replay.document("fim", path, "--theta", "nominal", "--nuisance", "J")["physical"]
-    assert (inertia["identified"], inertia["log_det"]) == (False, None)
-    known = replay.document("fim", path, "--theta", "nominal", "--nuisance", "J", "--prior", "pm50")
-    assert (known["prior"], known["physical"]["identified"]) == ("pm50", True)
-
-
 OBSERVED = Sensors("observer", 760.0)
 """With another declaration, a run of plant ``observer`` ends before it tells anything."""
-
-
-def test_an_observer_s_velocity_counts_for_nothing_and_that_is_said(bench: Bench, log: Log, replay: Replay) -> None:
-    path = log("observer.mcap", "plant=observer", on_bench=replace(bench, sensors=OBSERVED))
-    assert len(replay.document("fim", path)["notes"]) == 1
-    observed, direct = (replay.document("fim", path, "--model", name)["physical"] for name in ("observer", "exact"))
-    assert observed["log_det"] < direct["log_det"]
 
 
 @pytest.mark.parametrize("plant", ["observer", "exact", "stribeck"])
@@ -216,49 +180,6 @@ def test_another_bench_file_replaces_the_noise_of_the_one_in_the_log(
     file.write_text(text.replace("velocity = 1.0 ", "velocity = 10.0 "))
     once, ten = replay.document("fim", path), replay.document("fim", path, "--bench", file)
     np.testing.assert_allclose(np.array(ten["physical"]["matrix"]) * 100.0, once["physical"]["matrix"], rtol=1e-9)
-
-
-def test_a_cut_log_says_first_what_is_missing_and_gives_the_rest(path: Path, replay: Replay) -> None:
-    data = path.read_bytes()
-    path.write_bytes(data[: len(data) // 2])
-    text = replay.text("fim", path, "--theta", "true")
-    assert text.startswith("WARNING")
-    assert text.count("WARNING") == 2  # the file is cut, and the experiment with it
-    got = replay.document("fim", path, "--theta", "true")
-    assert (got["complete"], got["fit_sigmas"]["fits"]) == (False, True)
-    assert math.isfinite(got["physical"]["log_det"])
-    assert replay.text("info", path).startswith("WARNING")
-
-
-def test_an_experiment_that_tells_nothing_is_reported_as_that(
-    tmp_path: Path, simulate: Simulate, replay: Replay
-) -> None:
-    path = write_log(tmp_path / "zero.mcap", simulate(lambda *_: 0.0))
-    got = replay.document("fim", path)
-    assert got["physical"]["singular"] is True
-    assert (got["physical"]["log_det"], got["physical"]["condition"]) == (None, None)
-    assert got["physical"]["cramer_rao"] == dict.fromkeys(("k_m", "k_1", "T_c", "f_v"))
-    for prior in ((), ("--prior", "pm50")):
-        said = replay.text("fim", path, *prior)
-        assert "no information" in said
-        assert "inf" not in said.replace("information", "")
-
-
-def test_info_counts_what_the_run_counted(path: Path, run: SimRun, replay: Replay) -> None:
-    got, counters = replay.document("info", path), run.outcome.counters
-    assert got["complete"] is True
-    assert got["exit_reason"] == "DONE"
-    assert got["cycles"]["answered"] == counters.answered == 500
-    assert got["cycles"]["missed_periods"] == 0
-    assert (got["cycles"]["clipped"], got["cycles"]["limited"], got["cycles"]["returning"]) == (
-        *(counters.clipped, counters.limited, counters.returning),
-    )
-    assert got["largest"]["angle_max"] == counters.angle_max
-    assert got["largest"]["speed"] == counters.top_speed
-    assert got["largest"]["current"] == pytest.approx(counters.top_current, abs=2e-4)
-    assert got["messages"]["/cycle"] == 501
-    assert [event["code"] for event in got["events"]] == run.journal.codes
-    assert 0.5 < got["duration"] < 1.0
 
 
 def test_the_sample_that_stopped_a_run_counts_among_the_largest(

@@ -193,11 +193,6 @@ def test_a_velocity_that_lags_more_than_is_declared_ends_it(sheet: Bench) -> Non
             require_none(observed.problems(declared))
 
 
-def test_what_agrees_with_the_data_sheet_is_accepted(sheet: Bench) -> None:
-    for finding in (REST, CURRENT, MOVE, identification(sheet)):
-        check(finding, sheet)
-
-
 AWAY = [(2.9, 3.1), (0.3, 0.4), (2.001, 2.003), (0.497, 0.499)]  # Intervals outside of 0.5 to 2
 ACROSS = [(1.9, 2.001), (0.499, 0.6), (0.4, 2.5), (math.nan, math.nan), (1.0, math.inf)]  # Partly, or not known
 

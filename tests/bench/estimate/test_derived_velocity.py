@@ -154,12 +154,6 @@ def test_an_observer_that_is_not_declared_is_the_first_suspect_and_what_is_said_
     assert fit(declared, declared.model("exact"), [data], asked, method=method).validation.fits
 
 
-def test_a_lag_that_no_observer_makes_explains_no_misfit(bench: Bench) -> None:
-    """A score test alone finds a lag in other misfits too."""
-    found = [fit(bench, "exact", [record(bench, bench.plant(name), currents_of(bench, "chirp"))]) for name in MEASURED]
-    assert "velocity_lag" not in {e.validation.cause.suspect.name for e in found if e.validation.cause}
-
-
 @pytest.mark.parametrize("plant", ["exact", "stribeck", "late", "observer"])
 def test_a_declared_observer_stands_behind_every_plant_and_its_bandwidth_does_not_matter(
     bench: Bench, plant: str

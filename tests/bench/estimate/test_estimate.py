@@ -7,9 +7,8 @@ import pytest
 from scipy import stats
 
 from emb_bench.config.bench import Bench
-from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import search, start_points
-from emb_bench.estimate.records import METHODS, EstimationProblem
+from emb_bench.estimate.records import EstimationProblem
 from emb_bench.experiment.experiment import Experiment, planned
 from emb_bench.experiment.simulate import Theta, simulate
 from emb_bench.information.fisher import uniform_prior
@@ -171,19 +170,6 @@ def test_a_search_ends_at_the_border_of_a_tenth_of_nominal(bench: Bench) -> None
     assert held.values[3] >= 1.2 * b.f_v
     assert held.at_bound == ("f_v",)
     assert not fit(bench, plant, [data], starts=2).at_bound
-
-
-def test_every_method_answers_by_its_name_and_no_other(bench: Bench) -> None:
-    plant, data, b = bench.plant("exact"), exactly(bench), bench.brake
-    for name in METHODS:
-        asked = EstimationProblem(("f_v",), window=0.1) if name == "windows" else EstimationProblem(("f_v",))
-        found = method_of(name)(bench, plant, asked, starts=1, seed=1).fit([data])
-        assert found.method == name
-        assert found.values[0] == pytest.approx(b.f_v, rel=0.2)
-        low, high = found.intervals()[0]
-        assert low < found.values[0] < high
-    with pytest.raises(UsageError, match="no method is called 'kalman'; expected one of oem, pem, rls, windows"):
-        method_of("kalman")
 
 
 def test_the_same_seed_begins_at_the_same_points_all_within_the_ranges(bench: Bench) -> None:

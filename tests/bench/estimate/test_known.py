@@ -11,7 +11,6 @@ from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.records import NORMAL_95, EstimationProblem, freed
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.errors import UsageError
 
 from tests.bench.measurements import currents_of, fit, record  # isort: skip
 
@@ -54,12 +53,6 @@ def test_it_may_be_said_in_the_bench_file(bench: Bench) -> None:
     assert "J" not in asked.unmodelled
     without = with_systematic(EstimationProblem(("f_v",)), stated, stated.plant("exact"))
     assert without.known == {}
-
-
-def test_a_method_without_priors_takes_none(bench: Bench) -> None:
-    asked = freed(EstimationProblem(known={"k_m": (0.02, 1e-5)}), bench)
-    with pytest.raises(UsageError, match="no known parameter"):
-        fit(bench, "exact", [record(bench, bench.plant("exact"), currents_of(bench, "chirp"))], asked, method="rls")
 
 
 @pytest.mark.parametrize("known", [{}, {"k_m": 1e-3}])

@@ -83,20 +83,6 @@ def test_a_prior_is_a_ridge_around_its_mean(bench: Bench) -> None:
     assert np.diag(found.prior) == pytest.approx((expected / spread) ** 2, rel=1e-6)
 
 
-def test_it_finds_the_brake_roughly_and_output_error_far_better(bench: Bench) -> None:
-    true = np.array([getattr(bench.brake, n) for n in PARAMETER_NAMES])
-    found = [estimate(bench, "exact", [chirped(bench, seed=s)]) for s in range(20)]
-    errors = np.array([e.values for e in found]) / true - 1.0
-    assert (np.abs(errors.mean(axis=0)) < 0.1).all()
-    scatter = errors.std(axis=0, ddof=1)
-    claimed = np.mean([e.robust() for e in found], axis=0)
-    # Noise of a velocity counts in two periods with opposite signs, of which few lags know only a part.
-    assert (scatter < 1.5 * claimed).all()
-    assert (scatter > 0.3 * claimed).all()
-    better = fit(bench, "exact", [chirped(bench)])
-    assert (scatter > 50.0 * better.cramer_rao()).all()
-
-
 def test_it_says_that_it_estimates_no_systematic_errors_where_the_bench_cannot_exclude_them(bench: Bench) -> None:
     asked = with_systematic(EstimationProblem(), bench, bench.plant("exact"))
     trusted, found = (estimate(bench, "exact", [chirped(bench)], a) for a in (EstimationProblem(), asked))
@@ -104,17 +90,6 @@ def test_it_says_that_it_estimates_no_systematic_errors_where_the_bench_cannot_e
     assert len(caveats(found)) == len(caveats(trusted)) + 1
     assert (found.values == trusted.values).all()
     assert (found.deviations() == trusted.deviations()).all()
-
-
-def test_instruments_are_taken_into_account(bench: Bench) -> None:
-    true = np.array([getattr(bench.brake, n) for n in PARAMETER_NAMES])
-    for plant in ("offset", "late", "jitter"):
-        found = estimate(bench, plant, [chirped(bench, plant)])
-        assert (np.abs(found.values / true - 1.0) < 0.25).all()
-    found = estimate(bench, "observer", [chirped(bench, "observer")])
-    assert len(caveats(found)) == 3
-    late = replace(chirped(bench), late=np.full(500, 2e-5))
-    assert len(caveats(estimate(bench, "exact", [late]))) == 3
 
 
 def test_what_the_brake_never_met_is_not_told(bench: Bench) -> None:

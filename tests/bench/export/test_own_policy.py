@@ -197,13 +197,6 @@ def test_weights_in_a_file_beside_the_graph_are_taken_in_and_from_nowhere_else(t
         assert words in str(refusal.value)
 
 
-def test_currents_beyond_the_limit_are_clipped_and_it_is_said(tmp_path: Path) -> None:
-    onnx.save(graph(weights=100.0 * WEIGHTS), tmp_path / "mine.onnx")
-    assert "currents are beyond 6 A: clipped" in api.export_policy(tmp_path / "mine.onnx", tmp_path / "x.onnx")
-    policy = load_policy(tmp_path / "x.onnx", BENCH)
-    assert (current(policy, 50.0, 0.0, 0), current(policy, -50.0, 0.0, 0)) == (6.0, -6.0)
-
-
 def test_nothing_of_the_graph_s_makers_computer_is_in_the_file(tmp_path: Path) -> None:
     model = graph()
     model.doc_string = model.graph.doc_string = model.graph.node[0].doc_string = "/home/somebody/net.py"
@@ -243,11 +236,6 @@ def test_a_module_stays_as_it_was_and_is_exported_as_it_is_in_evaluation(tmp_pat
     with torch.no_grad():
         wanted = module.eval()(torch.tensor([[3.0, -0.5, 0.017]], dtype=torch.float64)).item()
     assert current(policy, 3.0, -0.5, 17) == pytest.approx(wanted, abs=1e-5)
-
-
-def test_a_function_of_a_tensor_is_exported(tmp_path: Path) -> None:
-    policy = exported(lambda inputs: 3.0 * torch.sin(40.0 * inputs[:, 2:3]), tmp_path)
-    assert current(policy, 0.0, 0.0, 20) == pytest.approx(3.0 * np.sin(0.8), abs=1e-5)
 
 
 @pytest.mark.parametrize(

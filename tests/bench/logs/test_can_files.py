@@ -5,20 +5,14 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterable
-from importlib import resources
 from pathlib import Path
-from typing import Any
 
-import asammdf
 import can
 import can.logconvert
-import cantools
 import pytest
 
-from emb_bench.cli.replay import main as emb_replay
 from emb_bench.logs.can_files import McapReader
 from emb_bench.logs.log import read_log
-from emb_runtime.errors import EXIT_DONE
 from emb_runtime.log.ring_buffer import FrameRecord
 from emb_runtime.records import Frame
 
@@ -62,26 +56,6 @@ def path(tmp_path: Path, run: SimRun) -> Path:
     return write_log(tmp_path / "run.mcap", run, steps=STEPS)
 
 
-def test_python_can_reads_our_log_by_its_ending(path: Path) -> None:
-    reader = can.LogReader(path)
-    assert isinstance(reader, McapReader)
-    with reader:
-        messages = list(reader)
-    frames = read_log(path).frames
-    assert len(messages) == len(frames)
-    for message, frame in zip(messages, frames, strict=True):
-        assert message.timestamp == (frame.time_ns + WALL) / 10**9
-        assert message.arbitration_id == frame.identifier
-        assert message.is_extended_id == frame.extended
-        assert message.is_remote_frame == frame.remote
-        assert message.is_error_frame == frame.error
-        assert message.is_rx != frame.own
-        assert message.dlc == len(frame.data)
-        assert bytes(message.data) == (b"" if frame.remote else frame.data)
-        assert message.channel == "sim"
-    assert {message.is_rx for message in messages} == {True, False}
-
-
 def test_a_log_can_be_read_twice_and_a_cut_one_as_far_as_it_goes(
     path: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -96,20 +70,6 @@ def test_a_log_can_be_read_twice_and_a_cut_one_as_far_as_it_goes(
         assert 0 < len(part) < len(whole)
         assert part == whole[: len(part)]
     assert f"{cut}: the file is cut at byte" in caplog.text
-
-
-def test_a_log_without_its_first_chunk_has_the_frames_of_the_others(
-    path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    whole = facts(McapReader(path))
-    data = path.read_bytes()
-    at = data.index(b"zstd") + 40  # inside the first chunk, which describes the topics, as the summary does
-    path.write_bytes(data[:at] + b"\x00\x00\x00" + data[at + 3 :])
-    found = facts(McapReader(path))
-    assert found
-    assert found == whole[-len(found) :]
-    assert "is damaged" in caplog.text
-    assert emb_replay(["export", str(path), "--topic", "/can/rx", "-o", str(path.with_suffix(".csv"))]) == EXIT_DONE
 
 
 def test_the_base_install_is_enough_and_the_parsers_do_not_load_python_can(path: Path) -> None:
@@ -158,21 +118,3 @@ def test_can_logconvert_writes_every_frame_of_a_log(
         assert message.dlc == len(frame.data) or (frame.remote and form == "log")  # candump's R has no length
         if not frame.remote:
             assert bytes(message.data) == frame.data
-
-
-@pytest.mark.filterwarnings("ignore")  # asammdf's own
-def test_asammdf_decodes_the_mf4_with_the_dbc_of_the_package(
-    run: SimRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path, out = write_log(tmp_path / "run.mcap", run, steps=STEPS), tmp_path / "run.mf4"
-    monkeypatch.setattr(sys, "argv", ["can_logconvert", str(path), str(out)])
-    can.logconvert.main()
-    dbc = str(resources.files("emb_runtime.can").joinpath("emb.dbc"))
-    decoded = asammdf.MDF(out).extract_bus_logging({"CAN": [(dbc, 0)]}).get("Angle")
-    database: Any = cantools.database.load_file(dbc)  # an independent decoder's values
-    message = database.get_message_by_name("EMB_Angle")
-    angles = [
-        message.decode(frame.data)["Angle"] for frame in read_log(path).frames if frame.identifier == message.frame_id
-    ]
-    assert len(angles) > STEPS
-    assert decoded.samples.tolist() == pytest.approx(angles, abs=1e-12)

@@ -3,7 +3,6 @@ from __future__ import annotations
 import os
 import random
 import signal
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -218,26 +217,6 @@ def test_dropped_records_make_a_log_incomplete(tmp_path: Path) -> None:
     log = read_log(tmp_path / "run.mcap")
     assert (log.complete, log.missing) == (False, "5 records were dropped while recording")
     assert len(log.events) == 4
-
-
-def test_a_log_whose_recorder_was_killed_is_read_up_to_the_last_flush(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    recorder = Recorder.start(path, LogHeader(0, 0, True, load_layout().text, {"emb.run": {"iface": "x"}}))
-    for k in range(200):
-        recorder.push(EventRecord(k, "X", str(k)))
-    deadline = time.monotonic() + 60
-    while not read_log(path).events:  # a part of the flush may be there before the rest
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    os.kill(recorder.pid, signal.SIGKILL)
-    recorder.finish({})
-    log = read_log(path)
-    assert not log.complete
-    assert "cut at byte" in log.missing
-    assert log.exit_reason.startswith("unknown")
-    assert log.run == {"iface": "x"}
-    assert [event.text for event in log.events] == [str(k) for k in range(len(log.events))]
-    assert log.events
 
 
 def test_what_a_log_should_carry_and_does_not_is_said(tmp_path: Path, run: SimRun) -> None:

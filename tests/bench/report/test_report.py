@@ -45,7 +45,7 @@ from emb_runtime.safety.state_machine import FAULTS, Fault
 
 from tests.bench.conftest import Replay  # isort: skip
 from tests.bench.simulated_logs import square, write_log  # isort: skip
-from tests.bench.report_pages import Report, make, read  # isort: skip
+from tests.bench.report_pages import Report, make  # isort: skip
 from tests.bench.experiment.test_experiment import Lose  # isort: skip
 from tests.conftest import Simulate  # isort: skip
 from tests.benches import SENSOR_TEXT
@@ -217,12 +217,6 @@ def test_the_page_needs_nothing_but_itself(report: Report, joint: Report) -> Non
         policy = dict(part.strip().split(" ", 1) for part in made.reader.values("content")[0].split(";"))
         assert (policy["default-src"], policy["img-src"]) == ("'none'", "data:")
         assert set(policy) == {"default-src", "style-src", "img-src", "base-uri", "form-action"}
-
-
-def test_every_figure_says_what_it_shows(report: Report) -> None:
-    says = report.reader.values("alt")
-    assert len(says) == report.reader.tags.count("img") >= 5
-    assert all(len(text) > 30 for text in says)
 
 
 def test_the_numbers_are_those_of_the_command_estimate(report: Report, good: Path, replay: Replay) -> None:
@@ -431,10 +425,6 @@ def test_a_report_replaces_a_report_but_never_what_it_reads(folder: Path, good: 
     page.write_text("the last one", encoding="utf-8")
     make(page, log, code=int(never.exists()))
     assert sorted(path.name for path in here.iterdir()) == ["log.html", "page.html", "page.json"]
-
-
-def test_the_reader_of_these_tests_sees_what_must_not_be_there() -> None:
-    assert "script" in read("<html><body><p><script>x</script></p></body></html>").tags
 
 
 def test_an_experiment_that_was_cut_short_has_a_cause_and_no_values(

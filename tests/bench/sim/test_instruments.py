@@ -116,13 +116,6 @@ def test_the_observer_s_velocity_is_right_at_constant_speed_and_lags_under_accel
     assert a * (settled - 1) * T_S - velocity == pytest.approx(a * T_S * (alpha / beta - 0.5), rel=1e-3)
 
 
-@pytest.mark.parametrize("t_s", [1e-3, 2e-3])
-def test_the_fastest_observer_is_the_difference_of_two_angles(t_s: float) -> None:
-    alpha, beta = observer_gains(6000.0, t_s)
-    assert (alpha, beta) == pytest.approx((1.0, 1.0), abs=0.02)
-    assert observer_noise(6000.0, t_s, 1e-3) == pytest.approx(math.sqrt(2.0) * 1e-3 / t_s, rel=0.02)
-
-
 def test_the_observer_works_on_the_measured_angle_with_its_noise_offset_and_jitter() -> None:
     instruments = Instruments(observer_bandwidth=500.0, encoder_offset=0.3)
     memory, alone = memory_of(instruments), Tracked(0.3, 0.0)

@@ -74,12 +74,6 @@ def test_a_simulation_longer_than_the_ring_is_logged_whole(processes: EmbRun, ac
     assert sum(log.counts.values()) > 1 << 14  # slots of the ring
 
 
-def test_the_shipped_bench_is_written_for_editing(emb_run: EmbRun, tmp_path: Path) -> None:
-    path = tmp_path / "my.toml"
-    emb_run.text("--write-bench", str(path))
-    assert path.read_text() == shipped_bench_text()
-
-
 def test_the_help_documents_every_exit_code_and_every_key_of_the_simulated_bus() -> None:
     out = subprocess.run([*EMB_RUN, "--help"], capture_output=True, text=True, check=True).stdout
     assert all(f"\n  {code}  " in out for code in range(7))
