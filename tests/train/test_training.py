@@ -106,6 +106,25 @@ def test_the_same_seed_gives_the_same_files(
         assert (other / path.name).read_bytes() == path.read_bytes(), path.name
 
 
+def test_the_search_for_a_plan_has_a_price_of_its_own_for_a_lie_that_the_motion_does_not_show(
+    finished_speeds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_tiny(monkeypatch)
+    bench = load_bench(finished_speeds / BENCH)
+
+    def returns(searched: float, learned: float) -> tuple[float, float]:
+        """Return of the best plan that was drawn, and score of the actor that follows the best of all."""
+        training = load_preset("interval", **{"plan.hidden": searched, "demands.hidden": learned})
+        folder, shown = tmp_path / f"{searched},{learned}", list[Any]()
+        begin_training(folder, training, bench)
+        *_, _ = run_training(folder, training, bench, shown.append)
+        return shown[0].best, metrics_of(folder)[0]["score"]
+
+    (plan, score), (same, paid), (free, _) = returns(10.0, 4.0), returns(10.0, 0.0), returns(0.0, 4.0)
+    assert plan == same < free
+    assert score < paid
+
+
 def test_hyper_parameters_are_set_by_their_names(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -278,7 +278,9 @@ def follow_plan(
         show(None)
         clone(actor, plan, bench, training.ppo, torch.Generator().manual_seed(training.seed))
 
-    environments = training.environments(bench, options.population * options.brakes, pool)
+    demands = msgspec.structs.replace(training.demands, hidden=options.hidden)
+    searching = msgspec.structs.replace(training, demands=demands)
+    environments = searching.environments(bench, options.population * options.brakes, pool)
     compared = Compared(environments, training.ppo.rollout, training.seed)
     rng = np.random.default_rng(np.random.SeedSequence(training.seed, spawn_key=(PLAN_STREAM,)))
     try:
