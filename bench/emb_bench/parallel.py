@@ -159,12 +159,12 @@ def processes() -> Iterator[Executor]:
 def _end_with_parent() -> None:
     """Let a process of a pool end with its parent: the pool's pipes do not, as its other processes hold them open."""
 
-    def wait() -> None:
-        connection.wait([parent.sentinel])
+    def wait(sentinel: int) -> None:
+        connection.wait([sentinel])
         os._exit(1)
 
     if (parent := multiprocessing.parent_process()) is not None:
-        threading.Thread(target=wait, daemon=True).start()
+        threading.Thread(target=wait, args=(parent.sentinel,), daemon=True).start()
 
 
 @contextmanager

@@ -244,7 +244,12 @@ def test_ctrl_c_and_divergence_leave_the_best_actor_so_far(
 def test_training_validation_and_evaluation_draw_other_brakes(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Any] = []
     environments = Training.environments
-    monkeypatch.setattr(Training, "environments", lambda *of: made.append(environments(*of)) or made[-1])
+
+    def noted(*arguments: Any) -> Any:
+        made.append(environments(*arguments))
+        return made[-1]
+
+    monkeypatch.setattr(Training, "environments", noted)
     bench, f_v = load_bench(finished / BENCH), BrakeParameters._fields.index("f_v")
     ranges, actor = bench.range_set("viscous"), tiny().untrained_actor(bench)
     drawn: list[float] = []
