@@ -87,7 +87,7 @@ def test_more_noise_than_the_bench_says_is_told_from_a_wrong_model(bench: Bench)
     found = fitted(bench, "exact", noise=1.5)
     validation = found.validation
     assert validation.alarming == {"size"}
-    assert "the noise may be larger than the bench says" in alarms(found)[0]
+    assert "the noise may be larger than in the bench file" in alarms(found)[0]
     assert validation.ratio == pytest.approx(2.25, rel=0.15)
     wrong = fitted(bench, "stribeck")
     assert not any("noise may be larger" in alarm for alarm in alarms(wrong))

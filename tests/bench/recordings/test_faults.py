@@ -215,7 +215,7 @@ def test_a_fault_comes_before_any_suspect_and_has_an_exit_code(
         assert main(command) == 1
         said = " ".join(capsys.readouterr().out.split())
         assert fault.said in said
-        assert "correct the map as the first line says" in said
+        assert "correct the map by the first line" in said
         assert "explains it" not in said
 
 
