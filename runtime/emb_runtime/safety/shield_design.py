@@ -66,11 +66,9 @@ class Box(NamedTuple):
 class Hidden(NamedTuple):
     """Samples that an acceleration counts for in the velocity that an observer does not show yet; 0 for a sensor."""
 
-    periods: tuple[
-        float, float, float, float, float
-    ]  # In each of the last periods before the measurement, newest first
+    periods: tuple[float, float, float, float, float]  # In each period before the measurement, newest first
     before: tuple[float, float, float, float, float, float]
-    """Before those of them in which own commands are known, by the age of the measurement: :func:`unseen`."""
+    """Before those of them whose own commands are known, by the age of the measurement: :func:`unseen`."""
 
 
 class Delay(NamedTuple):

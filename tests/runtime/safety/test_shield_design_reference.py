@@ -386,6 +386,8 @@ def test_what_an_observer_lags_by_is_the_integral_of_what_it_does_not_show(scale
 
 def test_a_sensor_of_the_velocity_hides_nothing() -> None:
     assert make_law(SENSOR_BENCH).delay.hidden == ((0.0,) * 5, (0.0,) * 6)
+    observed = make_law(taken(SENSOR_BENCH, observer=900.0)).delay
+    assert observed.hidden == hidden_by(observed.observer)
 
 
 def missing(damping: float, step: float, n: int) -> NDArray[np.float64]:
