@@ -50,9 +50,9 @@ from emb_runtime.system.clock import Clock, MonotonicClock
 
 LIMITS = {50.0: 60e-6, 99.9: 150e-6}  # Limits of the cycle's work [s], by quantile
 STEPS: dict[str, tuple[Any, str]] = {
-    "reading a frame (after the wait)": (SocketCan, "_read"),
-    "reception": (Reception, "take"),
-    "estimator": (Estimator, "take"),
+    "reading a frame (after the wait)": (SocketCan, "_read_socket"),
+    "reception": (Reception, "add_frame"),
+    "estimator": (Estimator, "add_sample"),
     "policy": (Policy, "act"),
     "clip, slew, shield": (phases, "decide"),
     "permission, encoding, guard": (core.Core, "answer"),

@@ -40,10 +40,9 @@ from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.control.actor import Actor
 from emb_runtime.errors import UsageError, near
 from emb_runtime.estimator.estimator import Estimator
-from emb_runtime.safety.response import OPEN, PROVEN, response_model, take, unproven_law
+from emb_runtime.safety.response import OPEN, PROVEN, begin_response, response_model, take, unproven_law
 from emb_runtime.safety.response import State as ProofState
-from emb_runtime.safety.response import begin as begin_response
-from emb_runtime.safety.sensor_monitor import begin, judge, largest_current
+from emb_runtime.safety.sensor_monitor import begin_monitor, judge, largest_current
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST, damped_current
 from emb_runtime.safety.shield_design import make_law
@@ -190,7 +189,7 @@ def run_excitation(
         raise UsageError(f"expected noise of shape ({count + 1}, 2), got {errors.shape}")
     limit, t_s = bench.limits.current, bench.timing.sample_time
     law = make_law(bench) if shielded else None
-    thresholds, monitor = None if law is None else sensor_thresholds(bench, law), begin(0.0, 0.0)
+    thresholds, monitor = None if law is None else sensor_thresholds(bench, law), begin_monitor(0.0, 0.0)
     proof = None if law is None else (response_model(bench, law), unproven_law(bench, law))
     response: ProofState | None = None
     verdict = OPEN
@@ -202,14 +201,14 @@ def run_excitation(
     def answer(x1: float, x2: float, k: int) -> float:
         nonlocal past, monitor, response, verdict
         y1, y2 = x1 + float(errors[k, 0]), x2 + float(errors[k, 1])
-        estimator.take(y1, y2, k, float(currents[k - 1]) if k else 0.0)
+        estimator.add_sample(y1, y2, k, float(currents[k - 1]) if k else 0.0)
         wanted[k] = excited.act(y1, y2, k, estimator)
         if law is None or thresholds is None or proof is None:
             u = clipped(float(wanted[k]), limit)
         else:
             model, slow = proof
             if k == 0:
-                monitor, response = begin(y1, y2), begin_response(model, y1, y2)
+                monitor, response = begin_monitor(y1, y2), begin_response(model, y1, y2)
             elif response is not None and verdict == OPEN:
                 response, verdict = take(model, response, bool(obeyed[k - 1]), y1, y2, past[0])
             if k > 0 and not monitor.confirmed:

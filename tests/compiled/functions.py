@@ -138,8 +138,8 @@ def _e2e(dice: random.Random) -> Iterator[Any]:
         data, start, counter = dice.randbytes(dice.randrange(1, 9)), dice.randrange(256), dice.randrange(-1, 16)
         payload = e2e.protect(start, data[1:]) if dice.random() < 0.5 else data
         yield (
-            *(e2e.profile1_start(dice.randrange(65536)), payload, e2e.check(start, payload)),
-            *(e2e.next_counter(counter), _tried(check.step, counter), check.last, check.errors),
+            *(e2e.profile1_start(dice.randrange(65536)), payload, e2e.has_valid_crc(start, payload)),
+            *(e2e.next_counter(counter), _tried(check.advance, counter), check.last, check.errors),
         )
 
 
@@ -177,7 +177,7 @@ def _reception(dice: random.Random) -> Iterator[Any]:
             _drawn_frame(dice, dice.choice(messages)),
         )
         for frame in frames[: 2 + (dice.random() < 0.1)]:
-            sample = take.take(frame._replace(time_ns=time_ns, own=dice.random() < 0.01, dropped=counter // 14))
+            sample = take.add_frame(frame._replace(time_ns=time_ns, own=dice.random() < 0.01, dropped=counter // 14))
             yield (
                 *(sample, take.inhibit_reason(time_ns + dice.randrange(-(10**7), 10**8)), take.rejected, take.dropped),
                 *(take.too_many_rejected, take.foreign_command, list(told), take.status, str(take.rejections())),
@@ -204,7 +204,7 @@ def _sensors(dice: random.Random) -> Iterator[Any]:
     while True:
         law = dice.choice(laws)
         angle, velocity = dice.uniform(-5.0, 80.0), dice.uniform(-300.0, 300.0)
-        state = monitor.begin(angle, velocity)
+        state = monitor.begin_monitor(angle, velocity)
         for _ in range(40):
             elapsed, current = dice.choice((1e-3, 1e-3, 1e-3, 2e-3)), _number(dice, 6.0)
             velocity += dice.uniform(-6.0, 6.0)
@@ -224,7 +224,7 @@ def _response(dice: random.Random) -> Iterator[Any]:
         model = dice.choice(models)
         angle, velocity, command = dice.uniform(-5.0, 20.0), dice.uniform(-9.0, 9.0), 0.0
         motor, past = dice.uniform(0.8 * model.box.motor_low, 1.2 * model.box.motor_high), [0.0] * dice.randrange(1, 5)
-        state = proof.begin(model, angle, velocity)
+        state = proof.begin_response(model, angle, velocity)
         for _ in range(40):
             if dice.random() < 0.3:
                 command = dice.choice((0.0, model.holds, model.moves, _number(dice, 6.0), 6.0, -6.0))
@@ -233,7 +233,7 @@ def _response(dice: random.Random) -> Iterator[Any]:
             angle += model.sample_time * velocity
             measured = (_number(dice, 100.0), _number(dice, 500.0)) if dice.random() < 0.02 else (angle, velocity)
             state, verdict = proof.take(model, state, dice.random() < 0.95, *measured, command)
-            yield verdict, state, proof.overshoot(model, state, model.extra), proof.fits(model, state)
+            yield verdict, state, proof.overshoot(model, state, model.extra), proof.explains(model, state)
 
 
 def _guard(dice: random.Random) -> Iterator[Any]:
@@ -263,7 +263,7 @@ def _states(dice: random.Random) -> Iterator[Any]:
         for _ in range(12):
             now_ns += dice.randrange(0, 5_000_000)
             event = dice.choice(events if dice.random() < 0.1 else tuple(machine.Event))
-            after = _tried(machine.step, run, event, now_ns)
+            after = _tried(machine.next_run, run, event, now_ns)
             run = after if isinstance(after, machine.Run) else run
             yield tuple(map(str, after)), machine.may_enable(run.state), machine.may_send(run.state)
 
@@ -285,7 +285,7 @@ def _estimator(dice: random.Random) -> Iterator[Any]:
     """Estimates of a brake that moves about as it should, and the currents that follow a target speed."""
     while True:
         model = Estimator(_bench()).model._replace(derived=dice.random() < 0.3)
-        state, gain = kalman.start(model), dice.choice((1.0, 0.4))
+        state, gain = kalman.initial_state(model), dice.choice((1.0, 0.4))
         angle, velocity, current, step = dice.uniform(-1.0, 40.0), dice.uniform(-200.0, 200.0), 0.0, 0
         for _ in range(30):
             step += dice.choice((1, 1, 1, 1, 2, 4))

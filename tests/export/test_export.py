@@ -173,7 +173,7 @@ def test_a_training_for_speeds_gives_target_speeds_of_the_estimate_which_the_run
     estimator, rng = Estimator(bench), np.random.default_rng(1)
     for step in range(HORIZON):
         angle, velocity = float(rng.normal(0.0, 1e-3)), float(rng.normal(0.0, 1.0))
-        estimator.take(angle, velocity, float(step), 0.0)
+        estimator.add_sample(angle, velocity, float(step), 0.0)
         with torch.no_grad():
             action = best.actor(torch.tensor([[angle, velocity, float(step), *estimator.parameters]]))
             speed = bench.limits.velocity * best.actor.part(action).item()

@@ -28,7 +28,7 @@ def reception(draw: Random) -> Played:
     while count < LENGTH:
         for frame in stream.period():
             count += 1
-            ours, expected = taken.take(frame), model.take(frame)
+            ours, expected = taken.add_frame(frame), model.take(frame)
             demand(ours == expected, frame, "made", ours, "expected", expected)
             now_ns = frame.time_ns + draw.randint(-2 * MS, 3 * MS)
             demand((taken.inhibit_reason(now_ns) == "") == model.permitted(now_ns), "permission at", now_ns, taken)

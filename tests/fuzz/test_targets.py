@@ -51,7 +51,7 @@ def a_frame_may_come_again(patch: Patch) -> None:
         self.last = counter
         return 1
 
-    patch.setattr(CounterCheck, "step", careless)
+    patch.setattr(CounterCheck, "advance", careless)
 
 
 def a_bad_frame_costs_one_good_one(patch: Patch) -> None:

@@ -55,7 +55,7 @@ def test_the_reception_believes_exactly_its_messages_and_is_touched_by_nothing_e
     reception = Reception(layout, bench, lambda _frame, _why: None)
     fresh = [w.valid_ns for w in reception.states]
     for frame in every(kind, valid):
-        reception.take(frame)
+        reception.add_frame(frame)
         touched = (frame.identifier, len(frame.data))
         if [w.valid_ns for w in reception.states] != fresh:
             believed.add(touched)
@@ -88,7 +88,7 @@ def test_no_frame_of_can_fd_is_believed_or_let_out(
     fresh = [w.valid_ns for w in reception.states]
     for identifier in range(0x800):
         frame = Frame(identifier, valid.get(identifier, b"").ljust(length, b"\0"))
-        assert reception.take(frame) is None
+        assert reception.add_frame(frame) is None
         with pytest.raises(GuardRejectedError):
             let_out(guard, frame)
     assert [w.valid_ns for w in reception.states] == fresh
@@ -109,7 +109,7 @@ def test_no_29_bit_identifier_that_ends_like_one_of_ours_is_taken_for_it(
     highs = range(0 if extended else 1, HIGH_BITS, step)
     for high in highs:
         frame = Frame(high << 11 | identifier, valid[identifier], extended=extended)
-        reception.take(frame)
+        reception.add_frame(frame)
         if identifier == COMMAND:
             try:
                 let_out(guard, frame)

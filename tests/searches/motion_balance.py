@@ -37,7 +37,7 @@ from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import BrakeParameters, Sensors
 from emb_runtime.control.loop import STOP_LISTEN_NS
 from emb_runtime.control.start_conditions import Bounds
-from emb_runtime.estimator.kalman import Model, believed, fits, follow, make_model, start
+from emb_runtime.estimator.kalman import Model, believed, fits, follow, initial_state, make_model
 from emb_runtime.estimator.speed_loop import current_for
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.records import NodeState, SensorSample
@@ -45,14 +45,13 @@ from emb_runtime.safety.motion_balance import (
     REST_SAMPLES,
     BalanceModel,
     balance_model,
-    begin,
+    begin_balance,
     origin,
     steady_motion,
     take,
     unexplained,
 )
-from emb_runtime.safety.sensor_monitor import begin as begin_monitor
-from emb_runtime.safety.sensor_monitor import judge, largest_current
+from emb_runtime.safety.sensor_monitor import begin_monitor, judge, largest_current
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST, damped_current
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
@@ -108,11 +107,11 @@ def fly(
     for m in range(out.shape[0]):
         b = script.brakes[m]
         p = BrakeParameters(b[0], b[1], b[2], b[3], b[4], b[5])
-        x[:], state = 0.0, start(model)
+        x[:], state = 0.0, initial_state(model)
         settle(instruments, instrument, 0.0)
         angle, velocity = script.errors[m, 0, 0] + instruments.encoder_offset, script.errors[m, 0, 1]
         monitor = begin_monitor(angle, velocity)
-        sums = begin(angle, velocity)
+        sums = begin_balance(angle, velocity)
         past, periods, obeyed, sent, felt, wanted = NO_PAST, 0, False, 0.0, 0.0, 0.0
         for k in range(law.steps):
             if periods == 0:

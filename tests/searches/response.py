@@ -42,7 +42,7 @@ from emb_bench.sim.instruments import settle
 from emb_bench.sim.simulated_brake import sent_current
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Sensors
-from emb_runtime.estimator.kalman import Model, believed, follow, make_model, start
+from emb_runtime.estimator.kalman import Model, believed, follow, initial_state, make_model
 from emb_runtime.estimator.speed_loop import current_for
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.safety.response import (
@@ -51,13 +51,12 @@ from emb_runtime.safety.response import (
     PROVEN,
     ResponseModel,
     State,
-    begin,
+    begin_response,
     response_model,
     take,
     unproven_law,
 )
-from emb_runtime.safety.sensor_monitor import HONEST, judge, largest_current
-from emb_runtime.safety.sensor_monitor import begin as begin_monitor
+from emb_runtime.safety.sensor_monitor import HONEST, begin_monitor, judge, largest_current
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST, Past
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
@@ -113,10 +112,10 @@ def fly(
     for m in range(out.shape[0]):
         b, row = script.brakes[m], out[m]
         p = BrakeParameters(b[0], b[1], b[2], b[3], b[4], b[5])
-        x[:], state = 0.0, start(model)
+        x[:], state = 0.0, initial_state(model)
         settle(instruments, instrument, 0.0)
         angle, velocity = script.errors[m, 0, 0] + instruments.encoder_offset, script.errors[m, 0, 1]
-        monitor, proof = begin_monitor(angle, velocity), begin(response, angle, velocity)
+        monitor, proof = begin_monitor(angle, velocity), begin_response(response, angle, velocity)
         verdict, past, periods, obeyed, given, felt, wanted, rest = OPEN, NO_PAST, 0, False, 0.0, 0.0, 0.0, -1
         for k in range(law.steps):
             if periods == 0 and rest < 0:

@@ -29,7 +29,7 @@ from emb_bench.sim.simulated_brake import pass_period, sent_current
 from emb_runtime.config.bench import BrakeParameters, Sensors
 from emb_runtime.safety.sensor_monitor import (
     HONEST,
-    begin,
+    begin_monitor,
     coasting_time,
     judge,
     lag_angle,
@@ -189,7 +189,7 @@ def fly(
         angle = script.errors[m, 0, 0] + instruments.encoder_offset
         velocity = script.errors[m, 0, 1]
         lie(kind if script.onsets[m] == 0 else NOTHING, script.sizes[m], ts, told, angle, velocity, angle)
-        state = begin(told[0], told[1])
+        state = begin_monitor(told[0], told[1])
         past = NO_PAST
         periods, obeyed, sent, felt = 0, False, 0.0, 0.0
         verdict = HONEST

@@ -350,7 +350,7 @@ def test_a_speed_becomes_the_current_of_the_runtimes_loop_and_the_estimate_is_th
         before = batch.experiments.k.copy()
         for i, estimator in enumerate(estimators):
             angle, velocity = batch.experiments.y[i].tolist()
-            estimator.take(angle, velocity, float(before[i]), float(batch.newest(batch.experiments.applied)[i]))
+            estimator.add_sample(angle, velocity, float(before[i]), float(batch.newest(batch.experiments.applied)[i]))
             np.testing.assert_array_equal(
                 seen[i], np.array([*batch.experiments.y[i], before[i], *estimator.parameters], np.float32)
             )

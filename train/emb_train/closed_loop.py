@@ -31,15 +31,13 @@ from emb_bench.sim.instruments import MEMORY, command, measure, settle
 from emb_bench.sim.simulated_brake import pass_period, sent_current
 from emb_runtime.config.bench import OLDEST_FRAME, PARAMETER_NAMES, BrakeParameters, Ranges
 from emb_runtime.errors import UsageError
-from emb_runtime.estimator.kalman import Model, State, believed, deviations, follow, make_model, start
+from emb_runtime.estimator.kalman import Model, State, believed, deviations, follow, initial_state, make_model
 from emb_runtime.estimator.speed_loop import current_for
 from emb_runtime.policy.contract import SAMPLE
-from emb_runtime.safety.response import OPEN, PROVEN, ResponseModel, response_model, take, unproven_law
+from emb_runtime.safety.response import OPEN, PROVEN, ResponseModel, begin_response, response_model, take, unproven_law
 from emb_runtime.safety.response import State as ResponseState
-from emb_runtime.safety.response import begin as begin_response
 from emb_runtime.safety.sensor_monitor import State as MonitorState
-from emb_runtime.safety.sensor_monitor import begin as begin_monitor
-from emb_runtime.safety.sensor_monitor import judge, largest_current
+from emb_runtime.safety.sensor_monitor import begin_monitor, judge, largest_current
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
 from emb_runtime.safety.shield import PAST, damped_current
 from emb_runtime.safety.shield_design import ShieldLaw, late_step, make_law
@@ -250,7 +248,7 @@ def first_loops(setup: Setup, count: int) -> Any:
 
 def first_loop(setup: Setup, angle: float, velocity: float) -> Loop:
     """The loop at the first measurement [rad, rad/s]."""
-    proof, estimate = begin_response(setup.response, angle, velocity), start(setup.model)
+    proof, estimate = begin_response(setup.response, angle, velocity), initial_state(setup.model)
     if setup.estimates:
         estimate = follow(setup.model, estimate, angle, velocity, 0.0, 0.0)
     return Loop(begin_monitor(angle, velocity), proof, OPEN, estimate)

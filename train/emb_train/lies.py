@@ -17,7 +17,7 @@ import numpy as np
 from emb_bench.compiled import compiled
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.safety.motion_balance import BalanceModel, balance_model, begin, origin, take, unexplained
+from emb_runtime.safety.motion_balance import BalanceModel, balance_model, begin_balance, origin, take, unexplained
 
 SWING = 10.0 * np.pi  # Angular frequency of a swinging scale [rad/s]
 
@@ -111,7 +111,7 @@ def clearness(bench: Bench, brakes: list[BrakeParameters], motion: Floats, curre
 def judge_records(model: BalanceModel, x: Floats, v: Floats, u: Floats, found: Floats) -> None:
     """Let the balance judge some records, at their ends; shapes as in :class:`Record` with one axis before."""
     for i in range(len(found)):
-        state = begin(x[i, 0], v[i, 0])
+        state = begin_balance(x[i, 0], v[i, 0])
         for k in range(u.shape[1]):
             state = take(model, state, True, x[i, k + 1], v[i, k + 1], u[i, k])
         residual, allowed = unexplained(model, state)

@@ -61,7 +61,7 @@ def of_actor(actor: Actor, bench: Bench) -> Excitation:
         requested: Currents = np.zeros(len(seen))
         for i, (estimator, row) in enumerate(zip(estimators, seen.tolist(), strict=True)):
             angle, velocity, step, applied = row
-            estimator.take(angle, velocity, step, applied)
+            estimator.add_sample(angle, velocity, step, applied)
             requested[i] = actor.act(angle, velocity, step, estimator)
         return requested
 

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 from msgspec import Meta
 
-from emb_runtime.config.typed import key_text, read, shown
+from emb_runtime.config.typed import excerpt, key_text, read
 from emb_runtime.errors import BenchFileError, near
 
 Solver = Literal["euler", "exact"]
@@ -101,7 +101,7 @@ def read_plant(name: str, document: Mapping[str, Any], source: str) -> Plant:
         raise BenchFileError(f"{at}: {expected}")
     solver = document.get("solver", "exact")
     if solver not in SOLVERS:
-        raise BenchFileError(f"{at}.solver: expected one of {', '.join(SOLVERS)}, got {shown(solver)}")
+        raise BenchFileError(f"{at}.solver: expected one of {', '.join(SOLVERS)}, got {excerpt(solver)}")
     keys = {*Mechanics._fields, *Instruments._fields}
     if unknown := [key for key in document if key not in keys]:
         expected = f"expected some of {', '.join(sorted(keys))}{near(unknown[0], keys)}"

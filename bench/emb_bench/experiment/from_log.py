@@ -397,7 +397,7 @@ def samples_before(log: RunLog, bench: Bench, count: int) -> list[SensorSample]:
             device_time_ns -= step * bench.timing.sample_time_ns
             break
     reception = Reception(layout, bench, lambda _frame, _why: None)
-    samples = [sample for frame in frames if (sample := reception.take(frame)) is not None]
+    samples = [sample for frame in frames if (sample := reception.add_frame(frame)) is not None]
     wrap_ns = layout.device_time_period_ns
     latest_ns = (wrap_ns + bench.timing.sample_time_ns) // 2  # half a period behind sample 0, in time that wraps
     return [s for s in samples if (s.device_time_ns - device_time_ns + wrap_ns // 2) % wrap_ns <= latest_ns][-count:]

@@ -28,10 +28,10 @@ def main(arguments: list[str]) -> int:
     try:
         server = Server(port=document["port"], empty="the run has not begun yet")
     except UsageError as err:
-        child_process.answer({"error": str(err)})
+        child_process.write_answer({"error": str(err)})
         return 1
     logs = NewLogs(Path(document["folder"]), document["pattern"])
-    child_process.answer({"ready": [server.page, server.addresses]})
+    child_process.write_answer({"ready": [server.page, server.addresses]})
     follow(logs, server, _wait, _complain)
     server.close()
     return 0

@@ -83,7 +83,7 @@ class Signals(msgspec.Struct, frozen=True, kw_only=True):
         for name, signal in self.given.items():
             if signal.unit not in allowed[name]:
                 expected = f"expected one of {', '.join(allowed[name])}, and scale as the factor to it"
-                raise FieldError(f"{name}.unit", f"{expected}; got {typed.shown(signal.unit)}")
+                raise FieldError(f"{name}.unit", f"{expected}; got {typed.excerpt(signal.unit)}")
             if not signal.range[0] < signal.range[1]:
                 raise FieldError(f"{name}.range", "expected the lower value first")
             if signal.wrap and name != "angle":
@@ -126,7 +126,7 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
         try:
             bytes(4).decode(self.encoding or "utf-8")  # without a byte it is not looked up
         except LookupError:
-            raise FieldError("encoding", f"expected one such as utf-8, got {typed.shown(self.encoding)}") from None
+            raise FieldError("encoding", f"expected one such as utf-8, got {typed.excerpt(self.encoding)}") from None
         if self.rows is not None and self.rows[0] >= self.rows[1]:
             raise FieldError("rows", "expected the first row, then the last")
 
@@ -194,7 +194,7 @@ class Machine(msgspec.Struct, frozen=True, kw_only=True):
             raise FieldError("guess", "expected at least one parameter that is not known")
         for i, name in enumerate(self.nuisances):
             if name not in UNITS:
-                raise FieldError(f"nuisances[{i}]", f"expected one of {', '.join(UNITS)}, got {typed.shown(name)}")
+                raise FieldError(f"nuisances[{i}]", f"expected one of {', '.join(UNITS)}, got {typed.excerpt(name)}")
         if {"J", "k_m"} <= {*guess} and not {"T_c", "f_v", "k_1"} & {*known}:
             raise FieldError(
                 "guess", "k_m, J and all loads scale together: without a known one only their ratios can be estimated"

@@ -100,7 +100,7 @@ class BrakeNode(SimulatedBrake):
             self.rejected += 1
             return
         stale = taken.answers != self._counter and taken.enable
-        if self._check.step(taken.counter) == 0 or stale or not self._permitted(taken):
+        if self._check.advance(taken.counter) == 0 or stale or not self._permitted(taken):
             self.rejected += 1
             return
         if not taken.enable and taken.current != 0.0:

@@ -1,7 +1,7 @@
 """Messages of ``emb.dbc``: plain little-endian signals, end-to-end protected; and a decoder by that table.
 
-The loop uses functions that are generated from it (:mod:`emb_runtime.can.generated`); the guard, the log and whoever
-explains a rejection decode by the table. What does not fit raises: nothing is masked or clipped into shape.
+The loop uses functions that are generated from it (:mod:`emb_runtime.can.generated`); the guard, the log and the
+reasons of a rejection use the table. What does not fit raises: nothing is masked or clipped into shape.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class Message:
             raise self._rejected(Fault.KIND, f"expected 11-bit identifier {self.identifier:#05x}, got {frame}")
         if len(data) != self.length:
             raise self._rejected(Fault.LENGTH, f"expected {self.length} bytes, got {len(data)}")
-        if not e2e.check(self.crc_start, data):
+        if not e2e.has_valid_crc(self.crc_start, data):
             raise self._rejected(Fault.CRC, f"{data.hex(' ')} is damaged, or its sender has another data id")
         if data[1] & 0x0F == e2e.NO_COUNTER:
             raise self._rejected(Fault.COUNTER, f"expected 0..{e2e.COUNTER_MODULUS - 1}, got {e2e.NO_COUNTER}")

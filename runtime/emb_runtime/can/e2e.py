@@ -50,7 +50,7 @@ def protect(start: int, body: bytes) -> bytes:
     return bytes((_advance(start, body),)) + body
 
 
-def check(start: int, payload: bytes) -> bool:
+def has_valid_crc(start: int, payload: bytes) -> bool:
     """Returns True if byte 0 of a payload (at least 1 byte) is the CRC of the other bytes."""
     return payload[0] == _advance(start, payload[1:])
 
@@ -96,15 +96,15 @@ class CounterCheck(LeakyCount):
     """Follows the alive counter of one message.
 
     Only an accepted frame moves the stored counter: if a rejected one did, replayed frames could rewind the check.
-    A frame that was rejected for its length, CRC or content is told by :meth:`reject`: its counter cannot be believed.
+    A frame rejected for its length, CRC or content goes to :meth:`reject`: its counter cannot be trusted.
     """
 
     def __init__(self, tolerated: int) -> None:
         super().__init__(tolerated)
         self.last: int | None = None  # Counter of the last accepted frame, 0..14; None before the first
 
-    def step(self, counter: int) -> int:
-        """Judge the counter, 0..14, of a frame that is valid in itself, and count it.
+    def advance(self, counter: int) -> int:
+        """Check the counter, 0..14, of a frame that is valid in itself, and count it.
 
         Returns:
             Steps since the last accepted frame: 1 it is the next one (or the first ever), n > 1 it jumped and n − 1

@@ -1,7 +1,7 @@
 """Encoder and decoder of a message as Python functions that are generated from its description in the DBC.
 
-Each is one expression per signal on the payload as one little-endian word. What does not fit is told by
-:meth:`emb_runtime.can.codec.Message.refusal` and ``decode``, which go by the table.
+Each is one expression per signal on the payload as one little-endian word. The errors are those of
+:meth:`emb_runtime.can.codec.Message.refusal` and ``decode``, which work by the table of signals.
 """
 
 from __future__ import annotations
@@ -62,12 +62,12 @@ class _Coded(NamedTuple):
     name: str  # Variable of its value
 
     @property
-    def step(self) -> Number:
+    def resolution(self) -> Number:
         """Record's value of a step."""
         factor = self.signal.factor
         return factor if self.field.scale == 1 else round(factor * self.field.scale)
 
-    def check(self) -> str:
+    def condition(self) -> str:
         """True for a value that can be encoded; NaN is refused by the order of the comparisons."""
         low, high = self.signal.minimum, self.signal.maximum
         if self.field.wraps or self.field.fixed is not None:
@@ -77,7 +77,7 @@ class _Coded(NamedTuple):
 
     def encoded(self) -> str:
         """The raw value of the value."""
-        value, step = self.name, self.step
+        value, step = self.name, self.resolution
         if self.field.fixed is not None:
             return str(self.field.fixed)
         if self.field.wraps:
@@ -97,13 +97,13 @@ class _Coded(NamedTuple):
         """The value of the raw value."""
         if self.field.choices:
             return f"choices_{self.name}[{self.name}]"
-        return self.name if self.step == 1 else f"{self.name} * {self.step!r}"
+        return self.name if self.resolution == 1 else f"{self.name} * {self.resolution!r}"
 
 
 def _encoder(message: Message, coded: list[_Coded]) -> str:
     names = ", ".join(c.name for c in coded if c.field.fixed is None)
     values = ", ".join(c.name if c.field.fixed is None else str(c.field.fixed) for c in coded)
-    checks = " and ".join(check for c in coded if (check := c.check()))
+    checks = " and ".join(condition for c in coded if (condition := c.condition()))
     word = " | ".join(f"({c.encoded()} & {c.signal.mask}) << {c.signal.shift}" for c in coded)
     return f"""def encode({names}):
     if not ({checks}):

@@ -126,7 +126,7 @@ class Trapezium:
 
 
 class Reception:
-    """Takes every frame that was on the bus, and gives the samples; each rejected frame is told with the reason."""
+    """Checks each frame of the bus, and pairs samples; reports each rejected frame with the reason."""
 
     def __init__(self, layout: Layout, bench: Bench, on_rejected: Callable[[Frame, str], None]) -> None:
         self._layout = layout
@@ -179,8 +179,8 @@ class Reception:
         """Number of rejections by message and reason, without those that never happened."""
         return {state.name: dict(state.rejections) for state in self.states if state.rejections}
 
-    def take(self, frame: Frame) -> SensorSample | None:
-        """Take one frame; gives a sample when it completes a valid pair."""
+    def add_frame(self, frame: Frame) -> SensorSample | None:
+        """Add one frame; gives a sample when it completes a valid pair."""
         if frame.dropped > self.dropped:
             self.dropped = frame.dropped
         if frame.error:
@@ -209,7 +209,7 @@ class Reception:
             state.errors.reject()
             self._count_rejected(frame, state, err.fault, str(err))
             return None
-        if state.errors.step(content.counter) == 0:
+        if state.errors.advance(content.counter) == 0:
             self._count_rejected(frame, state, Rejection.REPEATED, Rejection.REPEATED)
             return None
         state.valid_ns = frame.time_ns

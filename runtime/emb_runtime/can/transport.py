@@ -175,18 +175,18 @@ class SocketCan:
 
     def receive(self, deadline_ns: int) -> Frame | None:
         """See :meth:`Transport.receive`; the kernel reports that the interface has gone down once."""
-        frame = self._read()
+        frame = self._read_socket()
         while frame is None and deadline_ns > 0 and (now_ns := self._clock.now_ns()) < deadline_ns:
             if not self._wait_readable(self.descriptor, (deadline_ns - now_ns) * 1e-9):
                 return None
-            frame = self._read()
+            frame = self._read_socket()
         return frame
 
     def close(self) -> None:
         """See :meth:`Transport.close`."""
         self._socket.close()
 
-    def _read(self) -> Frame | None:
+    def _read_socket(self) -> Frame | None:
         """The next frame that waits, if one does."""
         now_ns = self._clock.now_ns()
         try:

@@ -83,7 +83,7 @@ class Seen(NamedTuple):
 
 
 class BusMonitor:
-    """Monitor of a bus: takes its frames, and counts. Each rejected frame is told with the reason."""
+    """Monitor of a bus: counts its frames; reports each rejected one with the reason."""
 
     def __init__(self, layout: Layout, bench: Bench, on_rejected: Callable[[Frame, str], None]) -> None:
         self._bench = bench
@@ -103,20 +103,20 @@ class BusMonitor:
         return self._reception.status
 
     def add_frame(self, frame: Frame) -> SensorSample | None:
-        """Take one frame; gives a sample when it completes a valid pair."""
+        """Add one frame; gives a sample when it completes a valid pair."""
         if not frame.error:
             name = None if frame.extended else self._names.get(frame.identifier)
             frames, first_ns, last_ns = self._seen.get(name, (0, frame.time_ns, frame.time_ns))
             self._seen[name] = Seen(frames + 1, first_ns, max(last_ns, frame.time_ns))
-        sample = self._reception.take(frame)
+        sample = self._reception.add_frame(frame)
         if sample is not None:
             self._follow(sample)
         return sample
 
     def add_old_frame(self, frame: Frame) -> None:
-        """Take a frame from before: it counts only if it must not be missed."""
+        """Add a frame from before: it counts only if it is alarming."""
         if is_alarming(frame, self._layout):
-            self._reception.take(frame)
+            self._reception.add_frame(frame)
 
     def statistics(self) -> BusStatistics:
         """Statistics so far."""

@@ -21,7 +21,7 @@ from emb_runtime.system.clock import Clock
 def experiment(
     plan: Plan, path: Path, console: Console, opened: tuple[Transport, Clock] | None = None
 ) -> tuple[dict[str, Any], int]:
-    """Run one experiment on a bus; bring the brake home before and after it where the plan has that and it is not.
+    """Run one experiment on a bus, with a way home before and after it where the plan has that and it is needed.
 
     The log must not exist; those of the ways home are called alike. A bus that is ``opened`` already stands for that of
     the plan, and is closed too.

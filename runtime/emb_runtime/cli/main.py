@@ -94,7 +94,7 @@ def main(argv: list[str] | None = None) -> int:
         try:
             with log_folder(plan.output.log), live_view(plan, console.stop_requested):
                 if plan.stage is Stage.READ_ONLY:
-                    return _read(plan, console)
+                    return _listen(plan, console)
                 return _experiment(plan, console)
         except RefusedError as err:
             if plan.output.json:
@@ -152,7 +152,7 @@ def _experiment(plan: Plan, console: Console) -> int:
     output = plan.output
     reporter = None if output.report is None else _reporter(output.report)
     document, exit_code = experiment(plan, log_path(output.log), console)
-    text = json_document(document) if output.json else summary.text(document, output.verbose)
+    text = json_document(document) if output.json else summary.run_text(document, output.verbose)
     show(text.partition("\n")[0] if output.quiet else text)
     if reporter is not None:
         reported = _report(reporter, document["log"], output)
@@ -186,7 +186,7 @@ def _report(module: str, log: str, output: Output) -> int:
     return subprocess.run(command, stdout=sys.stderr if output.json else None, check=False).returncode
 
 
-def _read(plan: Plan, console: Console) -> int:
+def _listen(plan: Plan, console: Console) -> int:
     path = log_path(plan.output.log, LISTEN_ONLY_LOG)
     transport, clock = open_transport(plan.iface, plan.bench)
     try:

@@ -28,7 +28,7 @@ NOT_JUDGED = "not judged: too little motion, or the bench declares a lag or fram
 NOT_PROVEN = "NOT PROVEN: too little motion, so the speed stayed low"
 
 
-def text(s: Document, details: bool = False) -> str:
+def run_text(s: Document, details: bool = False) -> str:
     """A :meth:`~emb_runtime.cli.documents.RunResult.document` as text: the answer and what was unusual.
 
     Every count with ``details``.

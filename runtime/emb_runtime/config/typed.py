@@ -98,10 +98,10 @@ def parse_toml(text: str, source: str, error: Callable[[str], EmbError]) -> dict
 def key_text(keys: Keys) -> str:
     """The place of a value, as ``plants.rough.f_l`` or ``sequences[3].action``."""
     text = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys).removeprefix(".")
-    return text if text.isprintable() and len(text) <= LONGEST_VALUE else shown(text)
+    return text if text.isprintable() and len(text) <= LONGEST_VALUE else excerpt(text)
 
 
-def shown(value: object) -> str:
+def excerpt(value: object) -> str:
     """A foreign value for a message: printable ASCII in one line, shortened."""
     try:
         text = ascii(value)
@@ -186,7 +186,7 @@ def _problem(value: object, kind: Any) -> str:
     """Reason to refuse a text that is not printable or a number that is not finite, which msgspec takes."""
     if isinstance(value, str):
         if not value or not value.isprintable() or len(value) > LONGEST_TEXT:
-            return f"expected a printable text of 1 to {LONGEST_TEXT} characters, got {shown(value)}"
+            return f"expected a printable text of 1 to {LONGEST_TEXT} characters, got {excerpt(value)}"
     elif isinstance(value, int | float) and not isinstance(value, bool) and _is_number(inspect.type_info(kind)):
         try:
             number = float(value)
@@ -222,7 +222,7 @@ def _got(value: object, kind: inspect.Type) -> str:
         return str(value).lower()  # as the file has it
     noun, words = _KINDS.get(type(value), ("", ()))
     literal = isinstance(kind, inspect.LiteralType) and type(value) in map(type, kind.values)
-    return f"{'' if literal or any(word in _expected(kind) for word in words) else noun}{shown(value)}"
+    return f"{'' if literal or any(word in _expected(kind) for word in words) else noun}{excerpt(value)}"
 
 
 def _missing(missing: list[tuple[Keys, Any]], remedy: str) -> str:

@@ -174,7 +174,7 @@ class Core:
         memory.records[at] = tuple.__new__(InputRecord, (decide_ns, ANSWER, 0 if lost else now_ns, "", lost))
         if lost:
             memory.counters.not_taken += 1
-            self._machine.note(Fault.SEND_QUEUE_FULL, lost, now_ns)
+            self._machine.record_fault(Fault.SEND_QUEUE_FULL, lost, now_ns)
             memory.unanswered(sample, memory.missed, now_ns)
         else:
             memory.answered(decide_ns, now_ns)
@@ -252,7 +252,7 @@ class Core:
             estimate=estimate.numbers,
             model_fits=estimate.estimator.fits,
             unexplained=setup.sensors.unexplained,
-            response=response.text if response.proven else "",
+            response=response.description if response.proven else "",
             goal_ns=estimate.goal_ns,
         )
 
@@ -267,12 +267,12 @@ class Core:
             memory.counters.confirmed += 1
             return
         dropped = reception.dropped
-        sample = reception.take(frame)
+        sample = reception.add_frame(frame)
         if frame.error:
             self._count_error(frame)
             return
         if reception.dropped > dropped:
-            self._machine.note(Fault.FRAMES_DROPPED, f"{reception.dropped} so far", frame.time_ns)
+            self._machine.record_fault(Fault.FRAMES_DROPPED, f"{reception.dropped} so far", frame.time_ns)
         if sample is not None:
             self._phase = self._phase.process_sample(sample)
 
@@ -282,7 +282,7 @@ class Core:
         if BUS_OFF in errors and self.running:
             raise StopError(Fault.BUS_LOST, "the CAN controller reports bus-off: it has stopped taking part")
         if counters.bus_errors == 1:
-            self._machine.note(Fault.BUS_ERRORS, ", ".join(errors), frame.time_ns)
+            self._machine.record_fault(Fault.BUS_ERRORS, ", ".join(errors), frame.time_ns)
 
     def _may_answer(self, now_ns: int) -> bool:
         """Returns True if one more command is not too fast, and every message of the node permits it."""
@@ -290,7 +290,7 @@ class Core:
             return False
         why = self._reception.inhibit_reason(now_ns)
         if why and self._permitted:
-            self._machine.note(Fault.PERMISSION_LOST, why, now_ns)
+            self._machine.record_fault(Fault.PERMISSION_LOST, why, now_ns)
         self._permitted = not why
         return not why
 

@@ -79,7 +79,7 @@ class Loop:
     def _cycle(self) -> None:
         """Read, answer, record."""
         core = self.core
-        frames = self._read(core.deadline_ns)
+        frames = self._read_frames(core.deadline_ns)
         # Before the frames: the watchdog's stop frames come from another socket and look like a stranger's commands.
         if (fault := self._fault_from_outside(self._now_ns)) is not None:
             core.latch(fault, self._now_ns)
@@ -92,7 +92,7 @@ class Loop:
                 return
         self._push_records()
 
-    def _read(self, deadline_ns: int) -> list[Frame]:
+    def _read_frames(self, deadline_ns: int) -> list[Frame]:
         """The next frame; with it all that wait if it is so old that newer ones are due. None of them at a deadline."""
         frame = self.receive(deadline_ns)
         now_ns = self._read_clock()
@@ -194,7 +194,7 @@ class Loop:
 
         def listen() -> None:
             while not (until_rest and self.core.at_rest):
-                frames = self._read(deadline_ns)
+                frames = self._read_frames(deadline_ns)
                 self.core.process_frames(frames, self._now_ns)
                 self._push_records()
                 if not frames or frames[-1].time_ns >= deadline_ns:

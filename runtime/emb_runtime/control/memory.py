@@ -114,7 +114,7 @@ class Memory:
         self.deadline_ns = sample.receive_time_ns + self.period_ns * 3 // 2
         return before
 
-    def start(self, sample: SensorSample) -> None:
+    def start_run(self, sample: SensorSample) -> None:
         """Start the experiment, or the way home, with its first sample."""
         self.start_ns = sample.device_time_ns
         self.counters.pairs = 1

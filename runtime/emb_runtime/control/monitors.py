@@ -134,18 +134,18 @@ class Sensors:
         self._pending: tuple[SensorSample, bool] | None = None  # newest sample for the balance; True if it follows
         self.unexplained = math.nan, math.inf  # Velocity that no brake explains, and what is allowed [rad/s]
 
-    def begin(self, sample: SensorSample) -> None:
+    def begin_run(self, sample: SensorSample) -> None:
         """Begin a run with its first sample."""
-        self.monitor.begin(sample)
-        self.response.begin(sample)
-        self._balance.begin(sample)
+        self.monitor.begin_run(sample)
+        self.response.begin_run(sample)
+        self._balance.begin_run(sample)
 
     def check(self, sample: SensorSample, memory: Memory) -> None:
         """Check the newest sample against the one before; raises StopError. Queues it for the motion balance."""
         interval = memory.interval
         try:
             self.monitor.check(interval.elapsed, sample, interval.obeyed, interval.command)
-            self.response.take(sample, interval.follows, interval.command)
+            self.response.add_sample(sample, interval.follows, interval.command)
         except StopError as stop:
             if stop.fault is not Fault.RESPONSE_LATE:  # which has taken it
                 self.response.watch(sample)
@@ -166,15 +166,15 @@ class Sensors:
         self._balance.judge_zero()
 
     def warm_up(self, sample: SensorSample, limit: float) -> None:
-        """Warm-up: run one dummy cycle, which :meth:`begin` forgets."""
-        self.monitor.begin(sample)
+        """Warm-up: run one dummy cycle, which :meth:`begin_run` forgets."""
+        self.monitor.begin_run(sample)
         with contextlib.suppress(StopError):
             self.monitor.check(self._law.sample_time, sample, True, 0.0)
         self.monitor.largest_current(limit)
-        self.response.begin(sample)
+        self.response.begin_run(sample)
         with contextlib.suppress(StopError):
-            self.response.take(sample, True, 0.0)
-        self._balance.begin(sample)
+            self.response.add_sample(sample, True, 0.0)
+        self._balance.begin_run(sample)
         self._balance.take(sample, True)
         self._balance.judge()
 

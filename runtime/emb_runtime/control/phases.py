@@ -112,8 +112,8 @@ class Control(Phase):
         """Warm-up: run one dummy cycle so that the interpreter specialises the code."""
         setup, estimator = self.setup, self.setup.estimate.estimator
         setup.sensors.warm_up(sample, setup.command_limits.current)
-        estimator.begin()
-        estimator.take(sample.angle, sample.velocity, 0, sample.applied_current)
+        estimator.begin_run()
+        estimator.add_sample(sample.angle, sample.velocity, 0, sample.applied_current)
         decide(setup.law, setup.command_limits, sample.angle, sample.velocity, 0.0, NO_PAST, 0.0, 0)
 
     def process_sample(self, sample: SensorSample) -> Phase:
@@ -151,7 +151,7 @@ class Control(Phase):
             check(sample, memory)
         if memory.missed:
             memory.pass_missed(memory.missed)
-        estimate.estimator.take(sample.angle, sample.velocity, step, sample.applied_current)
+        estimate.estimator.add_sample(sample.angle, sample.velocity, step, sample.applied_current)
         request = setup.actor.act(sample.angle, sample.velocity, step, estimate.estimator)
         return self._command(sample, checked(request, setup.current_limit), step)
 
@@ -162,14 +162,14 @@ class Control(Phase):
         if silent >= watch.stop_missed:
             raise StopError(Fault.SENSOR_LOST, f"{silent} periods without a valid pair")
         if silent == watch.soft_missed:
-            self.machine.note(Fault.SENSOR_LATE, f"{silent} so far", deadline_ns)
+            self.machine.record_fault(Fault.SENSOR_LATE, f"{silent} so far", deadline_ns)
 
     def _begin(self, sample: SensorSample) -> None:
         setup, memory = self.setup, self.memory
-        memory.start(sample)
+        memory.start_run(sample)
         self.machine.handle_event(Event.BEGIN_HOMING if setup.homing else Event.BEGIN, memory.read_ns)
-        setup.sensors.begin(sample)
-        setup.estimate.estimator.begin()
+        setup.sensors.begin_run(sample)
+        setup.estimate.estimator.begin_run()
 
     def _is_last(self, step: int) -> bool:
         return step >= self.setup.law.steps or self._at_home >= HOME_PAIRS
@@ -187,7 +187,7 @@ class Control(Phase):
             if time == 0.0:
                 raise
             # Now, since something else may end the run meanwhile, and would hide it.
-            self.machine.note(stop.fault, stop.detail, sample.receive_time_ns)
+            self.machine.record_fault(stop.fault, stop.detail, sample.receive_time_ns)
             return Coasting(self.setup, stop, time)
         return self
 

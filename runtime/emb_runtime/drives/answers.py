@@ -17,7 +17,7 @@ ANSWER_PART = 0.75  # Part of a period after a sample within which its answer is
 
 
 class Answers:
-    """The newest sample and its answer, which comes in time or is missed. By our messages, and a bench's limits."""
+    """The newest sample and its answer, which comes in time or is missed."""
 
     def __init__(self, layout: Layout, bench: Bench) -> None:
         self._layout = layout
@@ -58,7 +58,7 @@ class Answers:
             self._check.reject()
             self.refused += 1
             return None
-        is_new = self._check.step(command.counter) != 0
+        is_new = self._check.advance(command.counter) != 0
         if not command.enable:
             self.refused += not is_new or command.current != 0.0
             return command

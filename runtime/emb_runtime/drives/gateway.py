@@ -80,7 +80,7 @@ class Gateway:
             ready()
         ended_ns = None
         while ended_ns is None or self._clock.now_ns() < ended_ns:
-            self.step()
+            self.serve_once()
             if stop_requested() or self._node_lost is not None:
                 self.node.disarm()
                 if isinstance(self.node.phase, Off | Failed):
@@ -108,7 +108,7 @@ class Gateway:
         deadline_ns = self._after(LINGER)
         while (problem := self.node.release_problem) and self._clock.now_ns() < deadline_ns:
             try:
-                self.step()
+                self.serve_once()
             except BusError as err:
                 problem = f"{problem}: {err}"
                 break
@@ -124,14 +124,14 @@ class Gateway:
                 raise BusError(
                     f"no samples of the drive: check that it is on, on this bus, with this DBC{self.node.reported}"
                 )
-            self.step()
+            self.serve_once()
             if self._is_commanded:
                 raise BusError(f"cannot arm the drive: {INTRUDED}")
         else:
             return False
         self.node.arm(self._clock.now_ns())
         while isinstance(self.node.phase, Arming):
-            self.step()
+            self.serve_once()
             if stop_requested():
                 self.node.disarm()
         if isinstance(self.node.phase, Failed):
@@ -139,7 +139,7 @@ class Gateway:
             raise BusError(f"cannot arm the drive: {self.node.failure}{reported}{problem and f'; {problem}'}")
         return True
 
-    def step(self) -> None:
+    def serve_once(self) -> None:
         """Wait for what comes first, take what has come, and do what is due; BusError if the drive's bus is lost."""
         now_ns = self._clock.now_ns()
         self._wait(self.node.due_ns(now_ns + 1) - now_ns)

@@ -55,7 +55,7 @@ class LockStepDrive:
         """See :meth:`Transport.receive`."""
         self._deadline_ns = deadline_ns
         while not self._to_host and self._clock.now_ns() < deadline_ns:
-            self._gateway.step()
+            self._gateway.serve_once()
         return _popped(self._to_host)
 
     def close(self) -> None:

@@ -15,7 +15,7 @@ from msgspec import Meta, Struct
 from emb_runtime.can.codec import parse
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import LONGEST_NODE_WATCHDOG, Bandwidth, Bitrate, Lag, Sensors
-from emb_runtime.config.typed import MAX_TOML_BYTES, parse_toml, read, shown
+from emb_runtime.config.typed import MAX_TOML_BYTES, Positive, excerpt, parse_toml, read
 from emb_runtime.drives.dbc import MAX_DBC_BYTES, MessageText, find_messages
 from emb_runtime.drives.mapping import (
     PROPERTIES,
@@ -50,11 +50,10 @@ UNITS = {
 # --- the file -------------------------------------------------------------------------------------------------------
 
 
-def _says(description: str) -> Meta:
+def _described(description: str) -> Meta:
     return Meta(extra_json_schema={"description": description})
 
 
-Positive = Annotated[float, Meta(gt=0)]
 Wait = Annotated[float, Meta(gt=0, le=5)]  # [s]
 Byte = Annotated[int, Meta(ge=0, le=255)]
 States = Annotated[tuple[int, ...], Meta(min_length=1, max_length=16)]
@@ -117,7 +116,7 @@ class _Signals(Struct, kw_only=True):
     angle: _Angle
     velocity: Annotated[
         _Velocity,
-        _says("the velocity, by which the shield stops the brake; none is made from the angle: use a gateway"),
+        _described("the velocity, by which the shield stops the brake; none is made from the angle: use a gateway"),
     ]
     current: _Current | None = None
     state: _State | None = None
@@ -164,12 +163,12 @@ class _Node(Struct, kw_only=True):
     watchdog: Annotated[
         float,
         Meta(gt=0, le=LONGEST_NODE_WATCHDOG),
-        _says(
+        _described(
             f"the drive's time-out, above 0 to {LONGEST_NODE_WATCHDOG:g} s: a drive without one "
             "is not commanded, and no key accepts it"
         ),
     ]
-    end_stop_speed: Annotated[Positive, _says("the speed into an end stop that the brake bears, in rad/s")]
+    end_stop_speed: Annotated[Positive, _described("the speed into an end stop that the brake bears, in rad/s")]
     accept: tuple[str, ...]
 
 
@@ -237,8 +236,10 @@ def _made(file: _File, text: str, dbc_text: str, source: str) -> Mapping:
         },
         command=command,
         state=state,
-        arm=tuple(reader.step(step, f"can.arm[{n}]", command, state) for n, step in enumerate(can.arm)),
-        disarm=tuple(reader.step(step, f"can.disarm[{n}]", command, state) for n, step in enumerate(can.disarm)),
+        arm=tuple(reader.sequence_step(step, f"can.arm[{n}]", command, state) for n, step in enumerate(can.arm)),
+        disarm=tuple(
+            reader.sequence_step(step, f"can.disarm[{n}]", command, state) for n, step in enumerate(can.disarm)
+        ),
         watchdog=file.node.watchdog,
         end_stop_speed=file.node.end_stop_speed,
         text=text,
@@ -251,7 +252,7 @@ def _made(file: _File, text: str, dbc_text: str, source: str) -> Mapping:
         more = f"; nor are {', '.join(missing[1:])}" if missing[1:] else ""
         raise reader.error("node.accept", f"'{missing[0]}' is not accepted: {PROPERTIES[missing[0]]}{more}")
     if surplus := [name for name in file.node.accept if name not in made.lost]:
-        raise reader.error("node.accept", f"{shown(surplus[0])} is nothing that this drive lacks")
+        raise reader.error("node.accept", f"{excerpt(surplus[0])} is nothing that this drive lacks")
     _require_carried(reader, made)
     return made
 
@@ -330,7 +331,7 @@ class _Reader:
         error = None if of.error is None else info.fields[of.error]
         return State(info.name, field, of.idle, of.active, of.timeout, error)
 
-    def step(self, of: _Step, key: str, command: Commanded, state: State | None) -> Step:
+    def sequence_step(self, of: _Step, key: str, command: Commanded, state: State | None) -> Step:
         if of.wait is not None and of.wait.state is not None and state is None:
             raise self.error(f"{key}.wait.state", "this file names no state to wait for")
         frames = tuple(self._constant(name, given, f"{key}.send.{name}", command) for name, given in of.send.items())
@@ -359,7 +360,7 @@ class _Reader:
 
     def _message(self, name: str, key: str) -> DbcMessage:
         if (found := self._found.get(name)) is None:
-            raise self.error(key, f"the DBC has no message {shown(name)}")
+            raise self.error(key, f"the DBC has no message {excerpt(name)}")
         if found.is_fd or found.length > 8:
             raise self.error(key, f"{name}: expected a classical frame; use a gateway")
         if found.multiplexors > 1 or found.multiplexed:
@@ -379,12 +380,12 @@ class _Reader:
         key = f"{key}.signal"
         name, dot, signal = text.partition(".")
         if not dot:
-            raise self.error(key, f"expected MESSAGE.SIGNAL, got {shown(text)}")
+            raise self.error(key, f"expected MESSAGE.SIGNAL, got {excerpt(text)}")
         message = self._message(name, key)
         found = next((one for one in message.signals if one.name == signal), None)
         if found is None:
             names = _names({one.name for one in message.signals})
-            raise self.error(key, f"{name} has no signal {shown(signal)}; it has {names}")
+            raise self.error(key, f"{name} has no signal {excerpt(signal)}; it has {names}")
         pages = found.multiplexer_ids or []
         if len(pages) > 1:
             raise self.error(key, f"{text}: expected a signal of one value of the multiplexor, it is of {len(pages)}")

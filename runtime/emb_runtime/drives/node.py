@@ -152,7 +152,7 @@ class DriveNode:
         """
         receiver, before_ns = self.receiver, self.receiver.state_ns
         self.answers.conditions |= {name: (one, now_ns) for name, one in conditions_in(self._mapping, frame).items()}
-        sample = receiver.take(frame)
+        sample = receiver.add_frame(frame)
         if isinstance(self.phase, Arming) and receiver.state_ns != before_ns:
             self.arming.on_report(receiver.state(now_ns), receiver.state_ns)
         self._check_drive(now_ns)
@@ -162,7 +162,7 @@ class DriveNode:
             return []  # an answer to a frame of a sequence is of no sample
         if self._poll is not None:
             self._poll.is_awaited = False
-        device_ns = self.times.take(sample.time_ns)
+        device_ns = self.times.add_sample(sample.time_ns)
         if self.answers.deadline_ns is not None:
             self._miss()
         self._sensors.update(sample, device_ns)

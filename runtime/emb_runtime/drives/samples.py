@@ -46,8 +46,8 @@ class SampleTimes:
             f"less: declare [{low}, {math.ceil(periods - AGE_TOLERANCE)}], or make bus and computer faster"
         )
 
-    def take(self, time_ns: int) -> int:
-        """Take a sample's arrival; gives its time since the first [ns]: on the grid, or as it came if polled."""
+    def add_sample(self, time_ns: int) -> int:
+        """Add a sample's arrival; gives its time since the first [ns]: on the grid, or as it came if polled."""
         if self._grid_ns is None:
             self._grid_ns = float(time_ns)
             self._first_ns = time_ns

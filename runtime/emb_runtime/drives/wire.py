@@ -160,8 +160,8 @@ class Receiver:
             return DriveState.UNKNOWN
         return self.last_state
 
-    def take(self, frame: Frame) -> DriveSample | None:
-        """Take a frame from the bus; gives the sample that it completes.
+    def add_frame(self, frame: Frame) -> DriveSample | None:
+        """Add a frame from the bus; gives the sample that it completes.
 
         A frame that is none of the drive's is passed over; one that cannot be believed is counted.
         """

@@ -22,7 +22,7 @@ class WireGuardError(SafetyStopError):
 
 
 class WireGuard:
-    """Lets frames out to the drive that say what was meant, with currents up to a limit [A].
+    """Lets frames out to the drive that agree with what was meant, with currents up to a limit [A].
 
     Nobody else holds ``send``, which puts a frame on the bus.
     """
@@ -77,8 +77,8 @@ class WireGuard:
         current, step = value / command.factor, command.field.step(value) / abs(command.factor)
         if not abs(meant) <= self._limit:
             raise self._refused(f"{meant:g} A is beyond {self._limit:g} A")
-        if not _says(current, meant, step):  # so it is within the limit as well, to half a step
-            raise self._refused(f"its bytes say {current:g} A, meant were {meant:g} A")
+        if not _agrees(current, meant, step):  # so it is within the limit as well, to half a step
+            raise self._refused(f"its bytes say {current:g} A, expected {meant:g} A")
         for name, other in command.others.items():
             self._check_value(info.fields[name], data, other)
         self._check_unused(data, info)
@@ -100,7 +100,7 @@ class WireGuard:
 
     def _check_value(self, field: Field, data: bytes, meant: float) -> None:
         value = physical_value(field, data)
-        if not _says(value, meant, field.step(value)):
+        if not _agrees(value, meant, field.step(value)):
             raise self._refused(f"{field.name} is {value:g}, expected {meant:g}")
 
     def _check_unused(self, data: bytes, info: MessageInfo) -> None:
@@ -113,7 +113,7 @@ class WireGuard:
         return WireGuardError(f"the second guard refused a frame: {reason}")
 
 
-def _says(value: float, meant: float, step: float) -> bool:
+def _agrees(value: float, meant: float, step: float) -> bool:
     """Returns True if a value is the step nearest to the one meant, or as near as floating-point numbers are."""
     return abs(value - meant) <= (0.5 + ROUNDING) * step + EXACT * abs(meant)
 

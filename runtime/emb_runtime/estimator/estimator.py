@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
-from emb_runtime.estimator.kalman import Four, State, believed, deviations, fits, follow, make_model, start
+from emb_runtime.estimator.kalman import Four, State, believed, deviations, fits, follow, initial_state, make_model
 
 
 def estimated(bench: Bench) -> tuple[str, ...]:
@@ -20,15 +20,15 @@ class Estimator:
     def __init__(self, bench: Bench) -> None:
         """Make the model, and begin."""
         self.model = make_model(bench, bench.range_set(bench.prior))
-        self.state: State = start(self.model)
+        self.state: State = initial_state(self.model)
         self._computed: tuple[State | None, tuple[float, ...]] = None, ()  # the parameters, and the state they are of
 
-    def begin(self) -> None:
+    def begin_run(self) -> None:
         """Begin anew: the next sample is the first one of a run."""
-        self.state = start(self.model)
+        self.state = initial_state(self.model)
 
-    def take(self, angle: float, velocity: float, step: float, applied: float) -> None:
-        """Take in one sample; arguments as of :func:`emb_runtime.estimator.kalman.follow`."""
+    def add_sample(self, angle: float, velocity: float, step: float, applied: float) -> None:
+        """Add one sample; arguments as of :func:`emb_runtime.estimator.kalman.follow`."""
         self.state = follow(self.model, self.state, angle, velocity, step, applied)
 
     @property

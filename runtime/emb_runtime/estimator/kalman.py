@@ -107,7 +107,7 @@ def relative(bench: Bench, brake: BrakeParameters) -> Four:
     return k_m, k_1, t_c, f_v
 
 
-def start(model: Model) -> State:
+def initial_state(model: Model) -> State:
     """Estimate before the first sample: at home, parameters in the middle of their ranges."""
     (l2, l3, l4, l5), (h2, h3, h4, h5) = model.low, model.high
     return State(

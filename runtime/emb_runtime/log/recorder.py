@@ -40,10 +40,10 @@ class _WriterHere:
 
     def __init__(self, ring: Ring, document: Mapping[str, Any]) -> None:
         # By name, because the compiler would follow into it, and with it into libraries that it does not need.
-        begin = importlib.import_module("emb_runtime.log.recorder_process").begin
+        begin_recording = importlib.import_module("emb_runtime.log.recorder_process").begin_recording
         self.pid, self.alive = os.getpid(), True
         self._answer: dict[str, Any] = {}
-        self._recording = begin(ring, document)
+        self._recording = begin_recording(ring, document)
 
     def make_room(self) -> None:
         self._recording.drain()
@@ -51,7 +51,7 @@ class _WriterHere:
     def tell(self, document: Mapping[str, Any]) -> None:
         self._answer = self._recording.finish(dict(document))
 
-    def answer(self, _timeout: float) -> dict[str, Any]:
+    def read_answer(self, _timeout: float) -> dict[str, Any]:
         return self._answer
 
     def end(self) -> None:
@@ -116,7 +116,7 @@ class Recorder:
         """
         with contextlib.suppress(OSError):  # if the process is gone, its last answer follows
             self._child.tell(trailer)
-        answer = self._child.answer(timeout + self._size / READ_BACK)
+        answer = self._child.read_answer(timeout + self._size / READ_BACK)
         lost = self._ring.dropped + int(answer.get("lost", len(self._ring)))
         self._child.end()
         self._ring.close()

@@ -2,8 +2,8 @@
 
 ``python -m emb_runtime.log.recorder_process RING_FD HEADER_FD``, started by :class:`emb_runtime.log.recorder.Recorder`
 and by nobody else. It answers on standard output, one JSON object per line: first ``ready`` or ``error``, at the end
-what became of the file. Its standard input carries the trailer; that it ends without one means that the runtime died,
-and then the file is finished all the same.
+the state of the file. Its standard input carries the trailer; if it ends without one, the runtime has died, and the
+file is finished all the same.
 """
 
 from __future__ import annotations
@@ -293,7 +293,7 @@ class Recording:
         self.writer.write(record, self._now)
 
     def _guarded(self, action: Callable[[], None]) -> None:
-        """No failure to write must end the taking: the loop would fill the ring and count, and nobody would know."""
+        """Do an action; store its failure. The ring is emptied all the same: a full one would drop records."""
         if self.error:
             return
         try:
@@ -303,7 +303,7 @@ class Recording:
             self.lost += 1
 
 
-def begin(ring: Ring, document: Mapping[str, Any]) -> Recording:
+def begin_recording(ring: Ring, document: Mapping[str, Any]) -> Recording:
     """Make the file, with its first chunk; raises LogError where that cannot be."""
     try:
         file = NewFile(Path(document["path"]))
@@ -332,13 +332,13 @@ def main(arguments: list[str]) -> int:
     ring_fd, header_fd = map(int, arguments)
     document = child_process.read_document(header_fd)
     try:
-        recording = begin(Ring(ring_fd), document)
+        recording = begin_recording(Ring(ring_fd), document)
     except LogError as err:
-        child_process.answer({"error": str(err)})
+        child_process.write_answer({"error": str(err)})
         return 1
-    child_process.answer({"ready": True})
+    child_process.write_answer({"ready": True})
     answer = recording.run()
-    child_process.answer(answer)
+    child_process.write_answer(answer)
     return 1 if answer["error"] else 0
 
 

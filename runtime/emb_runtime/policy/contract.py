@@ -12,7 +12,7 @@ import msgspec
 from msgspec import Meta
 
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Limits
-from emb_runtime.config.typed import Positive, shown
+from emb_runtime.config.typed import Positive, excerpt
 from emb_runtime.errors import PolicyRefusedError
 
 CONTRACT_KEY = "emb.contract"  # Key of the contract in the ONNX ``metadata_props``
@@ -75,7 +75,7 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def __post_init__(self) -> None:
         if self.inputs not in INPUTS:
             expected = " or ".join(f"[{', '.join(names)}]" for names in INPUTS)
-            raise ValueError(f"inputs: expected {expected}, got {shown(self.inputs)}")
+            raise ValueError(f"inputs: expected {expected}, got {excerpt(self.inputs)}")
         for name, (low, high) in (("limits.angle", self.limits.angle), *self.ranges.items()):
             if not low <= high:
                 raise ValueError(f"{name}: expected a lower bound first")
@@ -137,4 +137,4 @@ def read_contract(text: str) -> Contract:
     try:
         return msgspec.json.decode(text, type=Contract)
     except (msgspec.MsgspecError, RecursionError) as err:
-        raise PolicyRefusedError(f"contract: {shown(str(err))}: export the policy anew") from err
+        raise PolicyRefusedError(f"contract: {excerpt(str(err))}: export the policy anew") from err

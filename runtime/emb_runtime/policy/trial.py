@@ -65,7 +65,7 @@ def _try(data: bytes, bench: Bench) -> None:
     except OSError as err:
         raise UsageError(f"cannot try the policy: {err}") from err
     try:
-        answer = child.answer(TIMEOUT)
+        answer = child.read_answer(TIMEOUT)
         exit_code = child.exit_code
     finally:
         child.kill()
@@ -95,15 +95,15 @@ def main(arguments: list[str]) -> int:
     os.dup2(nowhere, 2)  # what a library has to say when it fails is not for the user
     seconds = max(document["least"], document["multiple"] * time.process_time())
     confine(document["memory"], seconds)
-    child_process.answer({"ready": seconds})
+    child_process.write_answer({"ready": seconds})
     try:
         load_policy(data, bench)
     except EmbError as err:
-        child_process.answer({"refused": str(err)})
+        child_process.write_answer({"refused": str(err)})
     except MemoryError:
-        child_process.answer({"refused": f"loading it takes more than {document['memory'] >> 20} MiB of memory"})
+        child_process.write_answer({"refused": f"loading it takes more than {document['memory'] >> 20} MiB of memory"})
     else:
-        child_process.answer({"accepted": True})
+        child_process.write_answer({"accepted": True})
     return 0
 
 

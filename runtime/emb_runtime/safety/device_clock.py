@@ -31,7 +31,7 @@ OFF_GRID: Final = 5  # Samples off the sampling grid, by a leaky count, that are
 
 
 class DeviceClock:
-    """Judges the device time of each sample, of a node with this sampling period."""
+    """Checks the device time of each sample of a node with this sampling period."""
 
     _reference_ns: int
     _device_ns: int  # Of the last sample

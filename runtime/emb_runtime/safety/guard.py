@@ -183,7 +183,7 @@ class Guard:
         # Another transport's clock may put the stamp just ahead of now.
         if not -self._period_ns <= now_ns - sample_time_ns <= OLDEST_SAMPLE_PERIODS * self._period_ns:
             raise _rejected(f"computed from a sample {(now_ns - sample_time_ns) / 1e6:.3f} ms old")
-        # The counters alone say the same of the sample before and of the one 15 periods before that.
+        # Counters repeat after 15 periods: without its time an older sample looks like the one before.
         recent = sample_time_ns - self._sample_ns < COUNTER_MODULUS // 2 * self._period_ns
         change = command.current - slew_reference(self._last if recent else None, command.answers)
         if abs(change) > self._slew:

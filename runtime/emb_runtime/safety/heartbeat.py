@@ -14,8 +14,8 @@ import struct
 from emb_runtime.can.e2e import COUNTER_MODULUS
 
 LOST_AFTER = 4
-"""Heartbeats without a sign of life from the watchdog after which the loop holds it for lost. More than one, for the
-loop cannot tell a watchdog that is gone from a computer that was busy elsewhere; the node's watchdog still stands
+"""Heartbeats without a sign of life from the watchdog after which it counts as lost. More than one, for the loop
+cannot tell a watchdog that is gone from a computer that was busy elsewhere; the node's watchdog still stands
 behind both."""
 STOP_FRAMES = 3
 """Stop frames that end a run, from the loop or from the watchdog, one per period; one would do, and the bus may lose
@@ -71,12 +71,12 @@ class Heartbeat:
         return self._words[_TRIPPED_AT] != 0
 
     def arm(self, now_ns: int) -> None:
-        """Ask to be watched from now on, monotonic [ns]: before the first command that may leave."""
+        """Have the loop watched from now on, monotonic [ns]: before the first command."""
         self._words[_BEAT_AT] = now_ns
         self._words[_ARMED_AT] = 1
 
     def disarm(self) -> None:
-        """Ask to be watched no longer: after the last stop frame."""
+        """Have the loop watched no longer: after the last stop frame."""
         self._words[_ARMED_AT] = 0
 
     def beat(self, now_ns: int) -> None:
@@ -99,7 +99,7 @@ class Heartbeat:
 
     @property
     def armed(self) -> bool:
-        """Returns True if the loop asks to be watched. Whatever is not a clear no is a yes."""
+        """Returns True if the loop is to be watched: anything but 0."""
         return self._words[_ARMED_AT] != 0
 
     @property
@@ -111,7 +111,7 @@ class Heartbeat:
     def last(self) -> tuple[int, int]:
         """Counter of the last command that was sent or about to be, and of the sample that it answers; both 0..14.
 
-        They are that whatever the memory holds.
+        They are in this range whatever the memory holds.
         """
         word = self._words[_LAST_AT]
         return (word >> 4) % COUNTER_MODULUS, (word & 0xF) % COUNTER_MODULUS

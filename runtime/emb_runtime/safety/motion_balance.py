@@ -128,7 +128,7 @@ class State(NamedTuple):
     centred: Rows  # Products of earlier stretches, less the means: upper triangle of shape [TERMS, WIDTH]
 
 
-def begin(angle: float, velocity: float) -> State:
+def begin_balance(angle: float, velocity: float) -> State:
     """State at the first measurement of a run [rad, rad/s]."""
     total, equations, centred = [0.0] * WIDTH, _zeros(COEFFICIENTS), _zeros(TERMS)
     return State(angle, velocity, 0.0, 0.0, 0, 0, 0, 0, 0, STRIDE, total, _zeros(1), equations, _new_stretch(), centred)
@@ -328,11 +328,11 @@ class MotionBalance:
 
     def __init__(self, bench: Bench) -> None:
         self._model = balance_model(bench)
-        self._state = begin(0.0, 0.0)
+        self._state = begin_balance(0.0, 0.0)
 
-    def begin(self, sample: SensorSample) -> None:
+    def begin_run(self, sample: SensorSample) -> None:
         """Begin a run with its first sample."""
-        self._state = begin(sample.angle, sample.velocity)
+        self._state = begin_balance(sample.angle, sample.velocity)
 
     def take(self, sample: SensorSample, follows: bool) -> None:
         """Take in one more sample, as :func:`take`; raises StopError if the motion so far has no explanation."""

@@ -131,8 +131,8 @@ def response_model(bench: Bench, law: ShieldLaw) -> ResponseModel:
 def unproven_law(bench: Bench, law: ShieldLaw) -> ShieldLaw:
     """The law until the response is proven: so slow that the longest response passes no limit.
 
-    What is faster than its speed by the strongest motor at full current for that time, less what is declared, which the
-    law covers itself.
+    The limits of the speed are lower by what the strongest motor gains at full current in the longest response, less
+    the declared one, which the law covers.
     """
     home, unknown = law.home, LONGEST * law.sample_time - law.age_low * law.sample_time - declared_response(bench, law)
     fastest = max(bench.limits.velocity - unknown * law.box.motor_high * law.current, SLOWEST * law.homeward_speed)
@@ -145,7 +145,7 @@ def unproven_law(bench: Bench, law: ShieldLaw) -> ShieldLaw:
     )
 
 
-def begin(model: ResponseModel, angle: float, velocity: float) -> State:
+def begin_response(model: ResponseModel, angle: float, velocity: float) -> State:
     """State at the first measurement of a run [rad, rad/s]."""
     (b, c, d, e), (sb, sc, sd, se), sa, sf = model.prior, model.deviations, model.deviation, model.widest
     return State(
@@ -291,9 +291,9 @@ def _driven(
 
 
 def _transient(model: ResponseModel, commands: Six, flowing: float) -> float:
-    """Deviation of what a response shows that is shorter than the longest declared one [rad/s].
+    """Deviation of the velocity where the response is shorter than the longest declared one [rad/s].
 
-    After a change of the current it lasts as long as any response may take: a later one looks like it at first.
+    After a change of the current it lasts as long as any response may take: a longer one looks alike at first.
     """
     u = commands[model.age]
     changed = abs(u - flowing)
@@ -309,7 +309,7 @@ def overshoot(model: ResponseModel, state: State, response: float) -> tuple[floa
     return state.mean[5] - share * state.mean[1], math.sqrt(max(variance, 0.0))
 
 
-def fits(model: ResponseModel, state: State) -> bool:
+def explains(model: ResponseModel, state: State) -> bool:
     """Returns True if the filter's brake is one of the set, and explains what was measured."""
     inside = (1.0 - OUTSIDE) * model.box.motor_low < state.mean[1] < (1.0 + OUTSIDE) * model.box.motor_high
     return inside and state.misfit <= LEAST_FIT * state.innovations
@@ -329,7 +329,7 @@ def _verdict(model: ResponseModel, state: State) -> int:
         return CONTRADICTED
     if applied * (early + CONTRADICTS * early_error) < -0.5 * covered:
         return CONTRADICTED
-    if state.slides < LEAST_SLIDES or not fits(model, state):
+    if state.slides < LEAST_SLIDES or not explains(model, state):
         return OPEN
     least, least_error = overshoot(model, state, 0.0)
     # No command acts before it is sent: where the least declared age is 0, a low estimate is an error of the model.
@@ -364,9 +364,9 @@ class Response:
         self._rows: deque[Row] = deque(maxlen=STORED)
         self.stop: list[Row] = []
 
-    def begin(self, sample: SensorSample) -> None:
+    def begin_run(self, sample: SensorSample) -> None:
         """Begin a run with its first sample."""
-        self._state, self._verdict = begin(self.model, sample.angle, sample.velocity), OPEN
+        self._state, self._verdict = begin_response(self.model, sample.angle, sample.velocity), OPEN
         self._rows.clear()
         self._store(self._rows, sample, False, 0.0)
         self.law = self._slow
@@ -385,8 +385,8 @@ class Response:
         """Returns True if the velocity follows the commands as declared."""
         return self._verdict == PROVEN
 
-    def take(self, sample: SensorSample, follows: bool, command: float) -> None:
-        """Take one more sample, as :func:`take`; once the response is proven it is only stored.
+    def add_sample(self, sample: SensorSample, follows: bool, command: float) -> None:
+        """Add one more sample, as :func:`take`; once the response is proven it is only stored.
 
         Raises StopError if the velocity follows the commands later, or earlier, than declared.
         """
@@ -395,7 +395,7 @@ class Response:
             return
         self._state, self._verdict = take(self.model, self._state, follows, sample.angle, sample.velocity, command)
         if self._verdict == CONTRADICTED:
-            raise StopError(Fault.RESPONSE_LATE, self.text)
+            raise StopError(Fault.RESPONSE_LATE, self.description)
         if self._verdict == PROVEN:
             self.law = self._full
 
@@ -406,7 +406,7 @@ class Response:
             self._store(self.stop, sample, follows, sample.applied_current)
 
     @property
-    def text(self) -> str:
+    def description(self) -> str:
         """Measured delay and what is declared of it [samples]."""
         model, state = self.model, self._state
         late, error = overshoot(model, state, 0.0)

@@ -15,7 +15,7 @@ from typing import Final
 
 from emb_runtime.config.bench import OLDEST_FRAME, Bench
 from emb_runtime.estimator.observer import observer_gains
-from emb_runtime.safety.response import BEYOND, ResponseModel, Row, begin, fits, take
+from emb_runtime.safety.response import BEYOND, ResponseModel, Row, begin_response, explains, take
 from emb_runtime.safety.shield_design import LONGEST_LAG
 
 LEADS: Final = 0.3  # Samples by which a sensor's velocity leads the mean of the last period, at least: in truth 0.5
@@ -23,10 +23,10 @@ MOVES: Final = 14.0  # Change of the velocity that shows that, in its standard d
 BANDWIDTHS: Final = tuple(round(200.0 * 1.04**i, -1) for i in range(77))  # Of an observer, to 4,000 [rad/s]
 BELOW: Final = 0.96  # Share of it that is named, as the true one must not be less
 LAGS: Final = tuple(2.5e-4 * 1.08**i for i in range(40))  # Of the current, to 5 ms [s]
-LIKER: Final = 0.25  # Share of the squares that an observer must leave, of those that a sensor leaves
+OBSERVER_SHARE: Final = 0.25  # Share of the squares that an observer must leave, of those that a sensor leaves
 BRAKES: Final = 16  # Samples of the stop that tell a lag; later the brake rests
 MEAN_NOISE: Final = 1.73  # Deviation of the change of a mean velocity over √2, in that of the angle
-LIKELIER: Final = 9.0  # Twice the logarithm of the ratio of likelihoods that names a cause
+LIKELY: Final = 9.0  # Twice the logarithm of the ratio of likelihoods that names a cause
 ERRORS: Final = 16.0  # The same within which a lag may be the true one: four standard deviations
 
 
@@ -57,22 +57,22 @@ def _of_commands(model: ResponseModel, rows: Sequence[Row], stop: Sequence[Row],
     """The likeliest age of the frames, or lag of the current."""
     braked, later = stop[:BRAKES], [age for age in range(OLDEST_FRAME + 1) if age != model.age]
 
-    def unlike(age: int, lag: float, seen: int = 0) -> float:
-        return likelihood(model, rows, braked, age, lag, seen, means)
+    def deviance(age: int, lag: float, seen: int = 0) -> float:
+        return minus_log_likelihood(model, rows, braked, age, lag, seen, means)
 
-    declared = unlike(model.age, 0.0)
-    ages = {age: min(unlike(age, 0.0, seen) for seen in range(age + 1)) for age in later}
-    flows = {lag: unlike(model.age, lag) for lag in LAGS}
+    declared = deviance(model.age, 0.0)
+    ages = {age: min(deviance(age, 0.0, seen) for seen in range(age + 1)) for age in later}
+    flows = {lag: deviance(model.age, lag) for lag in LAGS}
     aged, lagged = min(ages.values()), min(flows.values())
-    if not min(aged, lagged) < declared - LIKELIER:  # this way round, nothing fits where both are infinite
+    if not min(aged, lagged) < declared - LIKELY:  # this way round, nothing fits where both are infinite
         return "" if not stop else _of_commands(model, rows, (), means)
     likely = sorted([(aged, _of_ages(model, ages)), (lagged, _of_lag(model, flows))])
-    return ", or ".join(named for value, named in likely if value < likely[0][0] + LIKELIER)
+    return ", or ".join(named for value, named in likely if value < likely[0][0] + LIKELY)
 
 
 def _of_ages(model: ResponseModel, ages: dict[int, float]) -> str:
     """The likeliest age, and the key with all that are likely."""
-    likely = [age for age in ages if ages[age] <= min(ages.values()) + LIKELIER]
+    likely = [age for age in ages if ages[age] <= min(ages.values()) + LIKELY]
     when = f"commands act {min(ages, key=ages.__getitem__)} periods after the sample that they answer"
     return f"{when}: [shield] frame_age = [{min(*likely, model.age)}, {max(*likely, model.oldest)}]"
 
@@ -87,7 +87,7 @@ def _of_lag(model: ResponseModel, flows: dict[float, float]) -> str:
     return f"the current lags by {lag * 1e3:.1f} ms: [shield] current_lag = {most:g}"
 
 
-def likelihood(
+def minus_log_likelihood(
     model: ResponseModel,
     rows: Sequence[Row],
     stop: Sequence[Row],
@@ -105,7 +105,7 @@ def likelihood(
     doubts = age + 1.0 + math.ceil(3.0 * lag / model.sample_time)
     slides = 6.0 * model.deviation
     tried = model._replace(age=0, oldest=0, lag=lag, extra=0.0, transient=0.0, doubts=doubts, slides=slides)
-    state, share = begin(tried, rows[0].angle, rows[0].velocity), model.current * lag
+    state, share = begin_response(tried, rows[0].angle, rows[0].velocity), model.current * lag
     mean, p = state.mean, state.covariance
     covariance = (*p[:10], share * p[6], *p[11:20], share * share * p[6])
     state = state._replace(mean=(*mean[:5], share * mean[1]), covariance=covariance)
@@ -118,7 +118,7 @@ def likelihood(
         acting = [0.5 * (u + before) for before, u in pairwise([flowing, *acting])]
     for row, current in zip([*rows[1:], *stop], acting, strict=False):
         state, _ = take(tried, state, row.follows, row.angle, row.velocity, current)
-    return state.likelihood if fits(tried, state) else math.inf
+    return state.likelihood if explains(tried, state) else math.inf
 
 
 def mean_velocities(sample_time: float, rows: Sequence[Row]) -> list[Row]:
@@ -141,12 +141,12 @@ def observer_bandwidth(model: ResponseModel, rows: Sequence[Row]) -> float:
             changes += change * change
     if changes < (MOVES * model.deviation) ** 2 or leads > LEADS * changes:
         return 0.0
-    unlike = {bandwidth: _unlike(model, rows, bandwidth) for bandwidth in BANDWIDTHS}
-    likest = min(unlike, key=unlike.__getitem__)
-    return likest if unlike[likest] < LIKER * squares else 0.0
+    misfits = {bandwidth: _observer_misfit(model, rows, bandwidth) for bandwidth in BANDWIDTHS}
+    best = min(misfits, key=misfits.__getitem__)
+    return best if misfits[best] < OBSERVER_SHARE * squares else 0.0
 
 
-def _unlike(model: ResponseModel, rows: Sequence[Row], bandwidth: float) -> float:
+def _observer_misfit(model: ResponseModel, rows: Sequence[Row], bandwidth: float) -> float:
     """Sum of the squared differences of the velocities from those of an observer of the angles [rad²/s²].
 
     The observer's angle follows from two velocities: at the begin and where a sample is missing it is unknown.

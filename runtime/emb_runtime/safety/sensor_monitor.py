@@ -1,6 +1,6 @@
-"""Sensors judged over time: what is small in each sample and grows.
+"""Monitor of the sensors over time: an error that is small in each sample and grows.
 
-The reception judges each step of the angle against the velocity; a slow lie passes it. Here two errors are summed up,
+The reception checks each step of the angle against the velocity; a slow drift passes it. Here two errors are summed up,
 each in both directions and from its last zero on (a CUSUM: Page, Continuous inspection schemes, Biometrika 41, 1954):
 
 * **Travel**: the angle against the integral of the velocity over the device's time.
@@ -74,7 +74,7 @@ class State(NamedTuple):
 NO_CURRENTS: Final[Currents] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def begin(angle: float, velocity: float) -> State:
+def begin_monitor(angle: float, velocity: float) -> State:
     """State at the first measurement of a run, without a current [rad, rad/s]."""
     zero = Cusum(0.0, 0.0)
     opposed = Opposed(0.0, 0.0, velocity, zero)
@@ -188,8 +188,8 @@ def largest_current(law: ShieldLaw, limits: SensorThresholds, state: State, limi
 def coasting_time(law: ShieldLaw, angle: float, velocity: float, unseen: float = 0.0) -> float:
     """Time in which friction alone stops any brake of the set near the origin [s]; 0 where it may not.
 
-    The signs of the sensors do not matter. Twice what the least friction takes of the measured speed, as the spring may
-    help the motion by half of it; and what it takes of all of the speed, with the help of the spring from here. What is
+    The signs of the sensors do not matter. With the least friction f, the strongest spring w and the distance x it is
+    max(2 v / f, (v + unseen) / (f − w x)): in the first term the spring helps the motion by half of f. What is
     ``unseen``, by :func:`unseen_speed`, only makes the wait longer: the limit of the first move has kept the distance.
     """
     box, friction = law.box, law.box.friction_low
@@ -339,11 +339,11 @@ class SensorMonitor:
     def __init__(self, law: ShieldLaw, limits: SensorThresholds) -> None:
         self._law = law
         self._limits = limits
-        self._state = begin(0.0, 0.0)
+        self._state = begin_monitor(0.0, 0.0)
 
-    def begin(self, sample: SensorSample) -> None:
+    def begin_run(self, sample: SensorSample) -> None:
         """Begin a run with its first sample."""
-        self._state = begin(sample.angle, sample.velocity)
+        self._state = begin_monitor(sample.angle, sample.velocity)
 
     def largest_current(self, limit: float) -> float:
         """Largest current that may be sent, at most ``limit`` [A]."""

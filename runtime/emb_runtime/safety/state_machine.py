@@ -1,7 +1,7 @@
 """State machine of a run, and its faults: no clock, no socket.
 
 A run passes INIT → SILENT → ARMED → ACTIVE → STOPPING → OVER; on the way home HOMING stands in place of ACTIVE.
-:func:`step` is the whole machine, as a pure function: a run's state and an event with its time give the next state;
+:func:`next_run` is the whole machine, as a pure function: a run's state and an event with its time give the next state;
 :class:`StateMachine` keeps the state and records the changes. A fault that latches is the run's for good: the first one
 counts, nothing clears it, and once anything may have been sent the only way out leads through the stop frames. A soft
 fault is reported and counted, and passes by itself.
@@ -86,7 +86,7 @@ _ENABLING: Final = (RunState.ACTIVE, RunState.HOMING)
 _SENDING: Final = (*_ENABLING, RunState.STOPPING)
 
 
-def step(run: Run, event: Event | Fault, now_ns: int) -> Run:
+def next_run(run: Run, event: Event | Fault, now_ns: int) -> Run:
     """State of a run after an event at a monotonic time [ns].
 
     Raises:
@@ -266,21 +266,21 @@ class StateMachine:
 
     def handle_event(self, event: Event, now_ns: int) -> None:
         """Take an event."""
-        before, self.run = self.run, step(self.run, event, now_ns)
+        before, self.run = self.run, next_run(self.run, event, now_ns)
         self._note_change(before, event, now_ns)
 
     def latch(self, fault: Fault, now_ns: int) -> None:
         """Take a fault that latches; :meth:`explain` records it, once the stop has begun."""
         self._latched = self.run, now_ns
-        self.run = step(self.run, fault, now_ns)
+        self.run = next_run(self.run, fault, now_ns)
 
     def explain(self, fault: Fault, detail: str) -> None:
         """Record the fault that was latched last, and the change of the state."""
         before, time_ns = self._latched
-        self.note(fault, detail, time_ns)
+        self.record_fault(fault, detail, time_ns)
         self._note_change(before, fault, time_ns)
 
-    def note(self, fault: Fault, detail: str, now_ns: int) -> None:
+    def record_fault(self, fault: Fault, detail: str, now_ns: int) -> None:
         """Record a fault; a soft one changes nothing else."""
         cause = FAULTS[fault].cause
         self._push_event(now_ns, fault.name, f"{cause}: {detail}" if detail else cause)

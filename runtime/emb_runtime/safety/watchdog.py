@@ -102,7 +102,7 @@ class WatchdogHandle:
         A failure is in its report, which is waited for at most ``timeout`` seconds, and never raised.
         """
         self._child.release()
-        answer = self._child.answer(timeout)
+        answer = self._child.read_answer(timeout)
         self._child.end()
         self.pulse.close()
         return WatchdogResult(**answer, realtime=self.realtime)

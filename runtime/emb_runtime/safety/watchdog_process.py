@@ -71,7 +71,7 @@ class SilenceMonitor:
         self._since_ns = now_ns
         self._stolen_ns = 0
 
-    def step(self, now_ns: int, beat_ns: int, armed: bool, gone: bool) -> LoopStatus:
+    def look(self, now_ns: int, beat_ns: int, armed: bool, gone: bool) -> LoopStatus:
         """Look once at a monotonic time, which is read after the loop's last sign of life, ``beat_ns`` [ns].
 
         One from the future is none: the memory is damaged. ``armed``: the loop is to be watched; ``gone``: it has
@@ -150,7 +150,7 @@ class Watchdog:
             self.time_ns = self.clock.now_ns()
             heartbeat.mark_alive(self.time_ns)
             self.lateness_ns = max(self.lateness_ns, self.time_ns - due_ns)
-            status = watch.step(self.time_ns, self.beat_ns, armed, gone)
+            status = watch.look(self.time_ns, self.beat_ns, armed, gone)
         return status
 
     def _stop(self, status: LoopStatus) -> None:
@@ -206,7 +206,7 @@ def main(arguments: list[str]) -> int:
         transport, clock = open_transport(document["iface"], bench, identifiers=())
         wait = _loop_is_gone(int(document["parent"]), clock)
     except (EmbError, OSError) as err:
-        child_process.answer({"error": str(err)})
+        child_process.write_answer({"error": str(err)})
         return 1
     watchdog = Watchdog(
         heartbeat=Heartbeat(heartbeat_fd),
@@ -218,8 +218,8 @@ def main(arguments: list[str]) -> int:
         wait=wait,
     )
     obtained = realtime.obtain(priority=PRIORITY) if document["real_time"] else {}
-    child_process.answer({"ready": obtained})
-    child_process.answer(watchdog.run())
+    child_process.write_answer({"ready": obtained})
+    child_process.write_answer(watchdog.run())
     transport.close()
     return 0
 

@@ -55,7 +55,7 @@ class Child:
                 process_group=0,
                 env=os.environ | {"EMB_CORE": "python"},  # msgspec reads no compiled record
             )
-        answer = self.answer(timeout)
+        answer = self.read_answer(timeout)
         if "ready" not in answer:
             self.kill()
             raise ChildProcessError(answer.get("error", f"the {name} process is not ready"))
@@ -83,7 +83,7 @@ class Child:
         pipe.write(json.dumps(dict(document)).encode() + b"\n")
         pipe.flush()
 
-    def answer(self, timeout: float) -> dict[str, Any]:
+    def read_answer(self, timeout: float) -> dict[str, Any]:
         """The next line from the process as a dictionary; one with ``error`` if none came within ``timeout`` [s]."""
         pipe = self._process.stdout
         assert pipe is not None
@@ -155,8 +155,8 @@ def read_document(fd: int) -> dict[str, Any]:
     return document
 
 
-def answer(document: Mapping[str, Any]) -> None:
-    """Write one line of JSON to the parent; one that is gone hears nothing."""
+def write_answer(document: Mapping[str, Any]) -> None:
+    """Write one line of JSON to the parent, unless it is gone."""
     with contextlib.suppress(OSError):
         os.write(1, json.dumps(dict(document)).encode() + b"\n")
 

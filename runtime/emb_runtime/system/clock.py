@@ -29,13 +29,13 @@ class MonotonicClock:
     """The computer's monotonic clock."""
 
     now_ns = staticmethod(time.monotonic_ns)
-    """Monotonic time [ns]; the function itself, because every cycle asks it several times."""
+    """Monotonic time [ns]; the function itself, because every cycle calls it several times."""
 
     def wall_offset_ns(self) -> int:
         """Offset from monotonic to Unix time [ns], as measured now.
 
-        The wall clock is read between two readings of the monotonic one, again if that took long: of three tries the
-        tightest counts, so that being interrupted does not spoil it.
+        The wall clock is read between two readings of the monotonic one, again if that took long. Of three tries
+        the shortest counts: an interrupted one does not.
         """
         tightest, offset = _NEVER, 0
         for _ in range(3):
@@ -56,7 +56,7 @@ class MonotonicClock:
 
 
 class TimeUnwrapper:
-    """Makes a device time that wraps into one that does not, from when each stamp arrived.
+    """Unwraps a device time by the arrival of each stamp.
 
     The arrival gives the device's clock to well within half a wrap; the stamp gives it exactly.
     Silences of any length are bridged as long as the two clocks drift less than half a wrap apart meanwhile.

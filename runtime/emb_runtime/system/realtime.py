@@ -23,7 +23,7 @@ _awake: int | None = None  # Its descriptor
 
 
 def obtain(priority: int = PRIORITY) -> dict[str, str]:
-    """Ask for real-time behaviour, and give what was obtained, or why not, per setting.
+    """Request real-time behaviour; returns what was obtained, or why not, per setting.
 
     Call it last before the loop: after warm-up, and after every child was started.
     """
@@ -42,14 +42,14 @@ def obtain(priority: int = PRIORITY) -> dict[str, str]:
 
 
 def step_back() -> None:
-    """Give way to the loop: ordinary scheduling, low priority. Best effort."""
+    """Give this process a lower priority than the loop: ordinary scheduling, niced. Best effort."""
     for action in (lambda: os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0)), lambda: os.nice(10)):
         with contextlib.suppress(OSError):
             action()
 
 
 def _stay_awake() -> str:
-    """Ask that no processor may sleep until this process ends; what was obtained."""
+    """Keep all processors awake until this process ends; returns what was obtained."""
     global _awake
     try:
         if _awake is None:

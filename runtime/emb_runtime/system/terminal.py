@@ -82,7 +82,7 @@ def show(text: str, dressed: Callable[[str], str] = str) -> None:
 
 
 def mention(text: str) -> None:
-    """Say how things go, on standard error; nobody need hear it."""
+    """Write progress to standard error; ignore errors of writing."""
     if sys.stderr is not None:  # closed before the program began
         with contextlib.suppress(OSError):
             sys.stderr.write(escaped(text, "\n") + "\n")
@@ -191,7 +191,7 @@ class Parser(argparse.ArgumentParser):
         return found
 
     def error(self, message: str) -> NoReturn:
-        """Say what is wrong in one line, and end the program."""
+        """Print what is wrong in one line, and end the program."""
         self.exit(UsageError.exit_code, f"{self.prog}: {escaped(message)} (see {self.prog} --help)\n")
 
     def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
@@ -218,7 +218,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def complain(command: str, err: EmbError) -> int:
-    """Say in one line what went wrong, and give the exit code for it."""
+    """Print in one line what went wrong; returns the exit code for it."""
     line = one_line(" ".join(str(err).split()), LONGEST_MESSAGE)
     mention(f"{command}: {line}")
     return err.exit_code

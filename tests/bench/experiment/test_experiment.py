@@ -337,7 +337,7 @@ def law(_angle: float, _velocity: float, step: float) -> float:
 def taken(log: RunLog, layout: Layout, bench: Bench) -> list[SensorSample]:
     """All samples that the runtime's reception takes from the frames in a log."""
     reception = Reception(layout, bench, lambda _frame, _why: None)
-    return [sample for frame in log.frames if (sample := reception.take(frame)) is not None]
+    return [sample for frame in log.frames if (sample := reception.add_frame(frame)) is not None]
 
 
 @pytest.mark.parametrize("bus", BUSES)

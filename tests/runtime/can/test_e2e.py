@@ -14,7 +14,7 @@ from emb_runtime.can.e2e import (
     WEIGHT,
     CounterCheck,
     LeakyCount,
-    check,
+    has_valid_crc,
     next_counter,
     profile1_start,
     protect,
@@ -29,13 +29,13 @@ def test_protection_equals_profile_1_of_an_independent_library(data_id: int, bod
     e2e.p01.e2e_p01_protect(theirs, data_id, increment_counter=False)
     ours = protect(profile1_start(data_id), body)
     assert ours == theirs
-    assert check(profile1_start(data_id), ours)
+    assert has_valid_crc(profile1_start(data_id), ours)
 
 
 # The library's check refuses the invalid counter as well; here the codec does that (Fault.COUNTER).
 @given(st.integers(0, 0xFFFF), st.binary(min_size=2, max_size=8).filter(lambda p: p[1] & 0x0F != NO_COUNTER))
 def test_checking_equals_profile_1_of_an_independent_library(data_id: int, payload: bytes) -> None:
-    assert check(profile1_start(data_id), payload) == e2e.p01.e2e_p01_check(bytearray(payload), data_id)
+    assert has_valid_crc(profile1_start(data_id), payload) == e2e.p01.e2e_p01_check(bytearray(payload), data_id)
 
 
 def test_counters_run_from_0_to_14_and_never_reach_the_invalid_one() -> None:
@@ -49,9 +49,9 @@ def test_counters_run_from_0_to_14_and_never_reach_the_invalid_one() -> None:
 @pytest.mark.parametrize("counter", [-1, NO_COUNTER, 100])
 def test_an_invalid_counter_is_refused_and_changes_nothing(counter: int) -> None:
     counter_check = CounterCheck(5)
-    counter_check.step(4)
+    counter_check.advance(4)
     with pytest.raises(ValueError, match=r"0\.\.14"):
-        counter_check.step(counter)
+        counter_check.advance(counter)
     assert (counter_check.last, counter_check.errors) == (4, 0)
 
 
@@ -64,7 +64,7 @@ def test_the_error_count_leaks_saturates_and_follows_its_law(tolerated: int, eve
             counter_check.reject()
         else:
             steps = 1 if last is None else (event - last) % COUNTER_MODULUS
-            assert counter_check.step(event) == steps
+            assert counter_check.advance(event) == steps
         if event is None or event == last:
             errors = min(errors + 4, 4 * tolerated)
         else:
@@ -77,7 +77,7 @@ def test_four_good_frames_forgive_one_bad_one() -> None:
     counter_check.reject()
     for counter in range(4):
         assert counter_check.errors == WEIGHT - counter
-        counter_check.step(counter)
+        counter_check.advance(counter)
     assert counter_check.errors == 0
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from msgspec import to_builtins
 
 from emb_runtime.can.codec import Fault, FrameRejectedError, Message, from_document
-from emb_runtime.can.e2e import check
+from emb_runtime.can.e2e import has_valid_crc
 from emb_runtime.can.generated import Codec, Field, generate_codec
 from emb_runtime.can.messages import (
     AngleFrame,
@@ -189,7 +189,7 @@ def test_no_single_or_double_bit_error_of_any_frame_at_all_can_pass(message: Mes
     """
     patterns = bit_errors(message)
     assert len(patterns) == math.comb(8 * message.length, 2) + 8 * message.length
-    assert not any(check(0, pattern.to_bytes(message.length, "little")) for pattern in patterns)
+    assert not any(has_valid_crc(0, pattern.to_bytes(message.length, "little")) for pattern in patterns)
 
 
 @given(body=st.binary(min_size=7, max_size=7))

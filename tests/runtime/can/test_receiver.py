@@ -56,7 +56,7 @@ class Harness:
         self.reception = Reception(layout, bench, lambda _frame, why: self.why.append(why))
 
     def take(self, *frames: Frame) -> list[SensorSample]:
-        return [sample for frame in frames if (sample := self.reception.take(frame)) is not None]
+        return [sample for frame in frames if (sample := self.reception.add_frame(frame)) is not None]
 
 
 @pytest.fixture

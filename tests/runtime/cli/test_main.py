@@ -141,7 +141,7 @@ import importlib, os, sys
 from emb_runtime.system import child_process, entry
 place, number = sys.argv.pop(1), int(sys.argv.pop(1))
 def press(): os.kill(os.getpid(), number)
-find, answer = importlib.import_module, child_process.Child.answer
+find, answer = importlib.import_module, child_process.Child.read_answer
 def imported(name):
     if place == "import" and name == "emb_runtime.cli.main":
         press()
@@ -150,7 +150,7 @@ def answered(child, timeout):
     if place == child._name:
         press()
     return answer(child, timeout)
-importlib.import_module, child_process.Child.answer = imported, answered
+importlib.import_module, child_process.Child.read_answer = imported, answered
 sys.exit(entry.emb_run())
 """
 """``emb-run`` that gets a signal in an import, while a policy is tried, or while the recorder starts."""

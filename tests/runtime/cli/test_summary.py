@@ -16,7 +16,7 @@ from emb_runtime.cli.documents import RunResult, refusal, trailer
 from emb_runtime.cli.options import parser, prepare
 from emb_runtime.cli.plan import Plan
 from emb_runtime.cli.preflight import Check, RefusedError
-from emb_runtime.cli.summary import brief, text
+from emb_runtime.cli.summary import brief, run_text
 from emb_runtime.config.bench import Bench
 from emb_runtime.control.memory import RunCounters
 from emb_runtime.control.result import Outcome
@@ -98,8 +98,8 @@ def test_every_count_and_every_trouble_has_its_words_and_an_undisturbed_run_few(
     )
     for changes, part in rows:
         changes |= {"counters": RunCounters(pairs=1, answered=490, unanswered=10, bus_errors=4)}
-        assert part in text(told(**changes), details=True), part
-    said = text(told(counters=RunCounters(pairs=501, answered=500, confirmed=503), watchdog=WatchdogResult()))
+        assert part in run_text(told(**changes), details=True), part
+    said = run_text(told(counters=RunCounters(pairs=501, answered=500, confirmed=503), watchdog=WatchdogResult()))
     assert len(said.splitlines()) <= 14
     assert "watchdog" not in said
 
@@ -114,7 +114,7 @@ def test_an_estimate_at_the_border_of_the_ranges_or_beyond_is_said_first_and_wit
             said = known.document()
             assert list(said["outside"]) == (["k_1"] if outside else [])
             assert said["exit_code"] == (EXIT_OUTSIDE if outside and strict else 0)
-            first, second, *_ = text(said).splitlines()
+            first, second, *_ = run_text(said).splitlines()
             assert ("OUTSIDE" in first, "the limits were not guaranteed" in second) == (outside, outside)
             stopped = replace(known, outcome=replace(known.outcome, fault=Fault.INTERRUPTED))
             assert stopped.document()["exit_code"] == 3
@@ -128,7 +128,7 @@ def test_an_estimate_of_a_run_that_ended_before_its_response_was_proven_says_not
 
 @pytest.mark.parametrize("fault", Fault)
 def test_every_fault_is_told_with_its_cause_its_detail_and_what_to_do(told: Any, fault: Fault) -> None:
-    said = text(told(fault=fault, detail="because", home=False)).splitlines()
+    said = run_text(told(fault=fault, detail="because", home=False)).splitlines()
     assert said[0] == f"STOPPED ({fault.name}): {FAULTS[fault].cause}: because"
     assert said[1] == f"  → {FAULTS[fault].advice}"
     assert brief(told(fault=fault, detail="because")) == f"{fault.name}: because, run.mcap"
@@ -137,11 +137,11 @@ def test_every_fault_is_told_with_its_cause_its_detail_and_what_to_do(told: Any,
 def test_the_ways_home_are_told_with_the_experiment(told: Any) -> None:
     way = told(RunType.HOMING)
     gone = refusal(RefusedError("nobody there", 4, (), Fault.NO_NODE), "can0")
-    said = text(told() | {"homing": {"before": way, "after": gone}})
+    said = run_text(told() | {"homing": {"before": way, "after": gone}})
     assert "way home   before the experiment: done: 490 of 500 answered, home, run.mcap" in said
     assert "way home   after the experiment: NO_NODE: nobody there" in said
-    assert "policy" not in text(told(RunType.HOMING))  # it does not move the brake then
-    assert text(told(RunType.HOMING, fault=Fault.NOT_HOME)).startswith("STOPPED on the way home (NOT_HOME)")
+    assert "policy" not in run_text(told(RunType.HOMING))  # it does not move the brake then
+    assert run_text(told(RunType.HOMING, fault=Fault.NOT_HOME)).startswith("STOPPED on the way home (NOT_HOME)")
 
 
 @pytest.mark.parametrize(
@@ -190,7 +190,7 @@ def test_the_last_estimate_is_told_with_its_interval_and_unit(ran: RunResult) ->
     said = replace(ran, outcome=known).document()
     halves = {"repeatability": pytest.approx(1.96e-7, rel=1e-4), "total": pytest.approx(4.38e-7, rel=1e-2)}
     assert said["estimate"]["f_v"] == {"value": 2e-5, "deviation": 1e-7, **halves, "unit": "N·m·s/rad"}
-    lines = text(said).splitlines()
+    lines = run_text(said).splitlines()
     assert lines[0].endswith(" samples answered, precise after 0.094 s, then home")
     assert said["goal_s"] == pytest.approx(0.094)
     for line in (
@@ -216,12 +216,12 @@ def test_a_motion_that_was_judged_is_in_document_and_log_and_one_that_was_not_is
         assert (found["unexplained"], found["unexplained_allowed"]) == numbers
         assert ("unexplained" in end) is judged
         assert not judged or (float(end["unexplained"]), float(end["unexplained_allowed"])) == numbers
-        assert "motion" not in text(told(run_type=RunType.HOMING, **changes))
+        assert "motion" not in run_text(told(run_type=RunType.HOMING, **changes))
 
 
 def test_a_motion_without_an_explanation_leads_to_what_to_check(ran: RunResult, told: Any) -> None:
     changed = replace(ran, outcome=replace(ran.outcome, fault=Fault.MOTION_UNEXPLAINED, detail="60 rad/s"))
     assert changed.exit_code == 8
-    said = text(told(fault=Fault.MOTION_UNEXPLAINED, detail="60 rad/s"))
+    said = run_text(told(fault=Fault.MOTION_UNEXPLAINED, detail="60 rad/s"))
     for word in ("MOTION_UNEXPLAINED", "60 rad/s", "zero", "scale", "current", "friction"):
         assert word in said

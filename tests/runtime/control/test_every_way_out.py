@@ -73,7 +73,7 @@ HANDED_IN: tuple[str, ...] = (
 )
 OURS: dict[str, tuple[type, str]] = {
     "monitor": (SensorMonitor, "check"),
-    "estimator": (Estimator, "take"),
+    "estimator": (Estimator, "add_sample"),
     "guard": (Guard, "send"),
     "guard's check": (Guard, "check"),
     "guard's drive": (Guard, "check_drive"),

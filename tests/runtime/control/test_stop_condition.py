@@ -63,7 +63,7 @@ def test_the_loop_estimates_along_whatever_the_policy_is_and_records_each_estima
     run = simulate(actor=FunctionActor(LAWS["square"]))
     estimator = Estimator(BENCH)
     for cycle, (time_ns, step, estimate) in zip(run.journal.cycles[:-1], run.journal.estimates, strict=True):
-        estimator.take(cycle.angle, cycle.velocity, cycle.step, cycle.applied_current)
+        estimator.add_sample(cycle.angle, cycle.velocity, cycle.step, cycle.applied_current)
         assert (time_ns, step, estimate) == (cycle.receive_time_ns, cycle.step, estimator.estimate)
     assert run.outcome.estimate == run.journal.estimates[-1][2]
     for value, deviation, true in zip(estimate[:4], estimate[4:], BENCH.brake[2:], strict=True):

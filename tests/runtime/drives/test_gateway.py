@@ -103,12 +103,12 @@ class Played:
             Frame(0x014, struct.pack("<ff", 0.0, 0.0), now_ns),
         ]
         if step:
-            self.gateway.step()
+            self.gateway.serve_once()
         return self.host.sent[before:]
 
     def command(self, current: float, answers: int = 0, enable: bool = True) -> None:
         self.host.waiting.append(answer(self, current, answers, enable))
-        self.gateway.step()
+        self.gateway.serve_once()
 
     def arm(self) -> None:
         for _ in range(READY_SAMPLES):
@@ -191,19 +191,19 @@ def test_the_bus_is_observed_for_a_time_before_the_drive_is_armed_and_an_end_by_
 
 
 def test_it_waits_until_the_next_thing_is_due_and_takes_some_frames_of_each_bus(played: Played) -> None:
-    played.gateway.step()
+    played.gateway.serve_once()
     assert played.waits == [MS + 1]
     played.period()
-    played.gateway.step()
+    played.gateway.serve_once()
     assert played.waits[-1] == 750_000  # the newest sample is to be answered by then
     played.host.waiting += [Frame(0x700, b"")] * 100
     played.drive.waiting += [Frame(0x700, b"")] * 100
-    played.gateway.step()
+    played.gateway.serve_once()
     assert (len(played.host.waiting), len(played.drive.waiting)) == (100 - MOST_FRAMES, 100 - MOST_FRAMES) == (36, 36)
     looks: list[int] = []
     played.host.waiting.clear()
     played.host.passes = lambda: looks.append(1)
-    played.gateway.step()
+    played.gateway.serve_once()
     assert looks == [1]
 
 
@@ -221,7 +221,7 @@ def test_echoes_and_error_frames_of_the_host_s_bus_are_no_commands(played: Playe
     for kind in ("own", "error"):
         played.period()
         played.host.waiting.append(answer(played, 2.0)._replace(own=kind == "own", error=kind == "error"))
-        played.gateway.step()
+        played.gateway.serve_once()
     assert (played.node.answers.refused, type(played.node.phase)) == (0, Ready)
 
 
@@ -261,7 +261,7 @@ def test_a_sample_without_an_answer_is_braked_and_a_host_that_stays_silent_ends_
         played.position += 1e-3
         played.period()
         played.clock.advance_to(played.clock.now_ns() + MS * 3 // 4)
-        played.gateway.step()
+        played.gateway.serve_once()
         assert played.torques[-1] == pytest.approx(-6.0 * 2.0 * 3.14159 / 60.0 * 0.0217, rel=1e-3)
         assert isinstance(played.node.phase, Active) == (number < 10)
     assert (type(played.node.phase), played.node.stop_reason) == (Stopping, StopReason.WATCHDOG)
@@ -276,7 +276,7 @@ def test_a_drive_that_is_given_up_in_the_last_period_that_the_host_may_miss_stay
         played.period()
         assert isinstance(played.node.phase, Active)
     played.clock.advance_to(played.clock.now_ns() + MS * 3 // 4)
-    played.gateway.step()
+    played.gateway.serve_once()
     assert isinstance(played.node.phase, Failed)
     assert (played.torques[-1], played.asked_states[-1]) == (0.0, IDLE)
     left = len(played.drive.sent)
@@ -506,7 +506,7 @@ def foreign(played: Played, identifier: int = 0x00E, **changed: Any) -> list[Fra
     before = len(played.host.sent)
     length = 8 if identifier == 0x00B else 0 if identifier == 0x018 else 4
     played.drive.waiting.append(Frame(identifier, bytes(length), played.clock.now_ns())._replace(**changed))
-    played.gateway.step()
+    played.gateway.serve_once()
     return [f for f in played.host.sent[before:] if f.identifier == LAYOUT.command.identifier]
 
 

@@ -197,7 +197,7 @@ def test_multiplexed_signals_are_read_by_the_value_of_their_multiplexor_and_sent
     for period in range(3):
         frames = [Frame(0x009, page[1 + (n + period) % 3], 10_000_000 * period + n) for n in range(3)]  # in any order
         frames.append(Frame(0x014, struct.pack("<ff", 0.0, 1.5), 10_000_000 * period + 3))
-        (sample,) = (found for frame in frames if (found := receiver.take(frame)) is not None)
+        (sample,) = (found for frame in frames if (found := receiver.add_frame(frame)) is not None)
         assert sample[:3] == pytest.approx((0.25 * 2.0 * math.pi, 0.5 * 2.0 * math.pi, 1.5))
     encoder, sent = Encoder(mapping), list[Frame]()
     guard = WireGuard(mapping, 6.0, sent.append)

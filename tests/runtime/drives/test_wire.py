@@ -38,24 +38,24 @@ def test_a_sample_is_complete_when_all_its_messages_have_come_in_any_order() -> 
     for turned in (False, True):
         receiver, pair = Receiver(odrive(), 20), [encoder(1.5, -2.0, MS), iq(0.75, MS + 100_000)]
         first, second = reversed(pair) if turned else pair
-        assert receiver.take(first) is None
-        sample = receiver.take(second)
+        assert receiver.add_frame(first) is None
+        sample = receiver.add_frame(second)
         assert sample is not None
         assert sample == pytest.approx((3.0 * math.pi, -4.0 * math.pi, 0.75, MS))
 
 
 def test_messages_of_two_samples_make_none() -> None:
     receiver = Receiver(odrive(), 20)
-    assert receiver.take(encoder(1.0, 0.0, MS)) is None
-    assert receiver.take(iq(0.0, MS + 600_000)) is None
-    assert receiver.take(encoder(2.0, 0.0, 2 * MS)) is not None
+    assert receiver.add_frame(encoder(1.0, 0.0, MS)) is None
+    assert receiver.add_frame(iq(0.0, MS + 600_000)) is None
+    assert receiver.add_frame(encoder(2.0, 0.0, 2 * MS)) is not None
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30, 17.1, -2.1])
 def test_a_value_that_cannot_be_believed_makes_no_sample(value: float) -> None:
     receiver = Receiver(odrive(), 20)
-    receiver.take(encoder(value, 0.0, MS))
-    assert receiver.take(iq(0.0, MS)) is None
+    receiver.add_frame(encoder(value, 0.0, MS))
+    assert receiver.add_frame(iq(0.0, MS)) is None
     assert receiver.rejected == {"Pos_Estimate out of range": 1}
     message = "Axis0_Get_Encoder_Estimates.Pos_Estimate out of range"
     assert receiver.refusal == f"{message}: {np.float32(value):g}, not -2 to 17"
@@ -72,8 +72,8 @@ def test_frames_of_the_wrong_length_and_of_others_make_no_sample() -> None:
         right._replace(error=True),
         right._replace(identifier=0x0A9),
     ):
-        receiver.take(wrong)
-    assert receiver.take(iq(0.0, MS)) is None
+        receiver.add_frame(wrong)
+    assert receiver.add_frame(iq(0.0, MS)) is None
     assert receiver.rejected == {"wrong length": 2}
     assert receiver.refusal == "Axis0_Get_Encoder_Estimates: wrong length: 0 bytes came, the DBC has 8"
 
@@ -90,7 +90,7 @@ def test_the_state_is_what_the_heartbeat_says_until_it_is_too_old() -> None:
         (heartbeat(3, 4 * MS), DriveState.FAULT, f"Axis_State is 3{known}"),
         (heartbeat(1, 5 * MS), DriveState.IDLE, f"Axis_State is 1{known}"),
     ):
-        receiver.take(frame)
+        receiver.add_frame(frame)
         assert receiver.state(frame.time_ns) is state
         assert receiver.reported == f"Axis0_Heartbeat.{reported}"
     assert receiver.state(255 * MS) is DriveState.IDLE
@@ -102,8 +102,10 @@ def test_an_angle_that_begins_anew_is_continued() -> None:
     true = [-2.0, 30.0, 170.0, 200.0, 340.0, 380.0, 500.0, 660.0, 740.0, 600.0, 440.0, 280.0, 110.0, -60.0]  # deg
     for index, angle in enumerate(true):
         time_ns = index * MS
-        receiver.take(Frame(0x1005, struct.pack(">hhhh", 0, 0, 0, round(angle % 360.0 * 50)), time_ns, extended=True))
-        sample = receiver.take(Frame(0x905, struct.pack(">ihh", 7 * 60, 15, 0), time_ns, extended=True))
+        receiver.add_frame(
+            Frame(0x1005, struct.pack(">hhhh", 0, 0, 0, round(angle % 360.0 * 50)), time_ns, extended=True)
+        )
+        sample = receiver.add_frame(Frame(0x905, struct.pack(">ihh", 7 * 60, 15, 0), time_ns, extended=True))
         assert sample is not None
         assert math.degrees(sample.angle) == pytest.approx(angle, abs=0.011)
         assert sample.velocity == pytest.approx(2.0 * math.pi)
@@ -122,8 +124,8 @@ def test_a_protected_message_is_checked_and_a_repeated_one_is_none() -> None:
         (protected(15, 5 * MS), False),
         (protected(14, 6 * MS), True),
     ):
-        receiver.take(encoder(0.0, 0.0, frame.time_ns))
-        assert (receiver.take(frame) is not None) is whole
+        receiver.add_frame(encoder(0.0, 0.0, frame.time_ns))
+        assert (receiver.add_frame(frame) is not None) is whole
     assert receiver.rejected == {"repeated": 1, "wrong checksum": 1, "invalid counter": 1}
     assert receiver.refusal.endswith(": invalid counter")
 
@@ -133,7 +135,7 @@ def test_a_message_whose_counter_skips_frames_for_ever_is_missing_some(step: int
     toml, dbc = protected_odrive()
     receiver = Receiver(parse_mapping(toml, dbc, "drive.toml"), 5)
     for index in range(40):
-        receiver.take(protected(index * step % 15, index * MS))
+        receiver.add_frame(protected(index * step % 15, index * MS))
     assert receiver.frames_missing == ("Axis0_Get_Iq" if missing else "")
 
 
@@ -141,5 +143,5 @@ def test_frames_that_were_lost_now_and_then_are_not_too_many() -> None:
     toml, dbc = protected_odrive()
     receiver = Receiver(parse_mapping(toml, dbc, "drive.toml"), 5)
     for index in (index for index in range(400) if index % 6 and index not in range(100, 104)):
-        receiver.take(protected(index % 15, index * MS))
+        receiver.add_frame(protected(index % 15, index * MS))
         assert receiver.frames_missing == ""

@@ -254,7 +254,7 @@ def test_a_current_meant_that_is_beyond_the_limit_is_refused_whatever_the_bytes_
     for limit in (0.0, 0.5):  # little or no current
         it = Guarded(limit)
         assert it.guard.command(by_hand(-limit), -limit) == -limit
-        it.refuses(by_hand(limit + STEP, 1), limit, f"say {limit + STEP:g} A, meant were {limit:g} A")
+        it.refuses(by_hand(limit + STEP, 1), limit, f"say {limit + STEP:g} A, expected {limit:g} A")
 
 
 def test_bytes_may_be_off_by_half_a_step_and_by_what_floating_point_numbers_are_off() -> None:
@@ -263,7 +263,7 @@ def test_bytes_may_be_off_by_half_a_step_and_by_what_floating_point_numbers_are_
         for _ in range(9):  # about 0 the value at which both are the same to the last bit
             farthest = says + side * (0.500001 * STEP + 1e-12 * abs(farthest))
         assert Guarded().guard.command(by_hand(says), farthest - side * rounding) == says
-        Guarded().refuses(by_hand(says), farthest + side * max(rounding, 1e-16), "meant were")
+        Guarded().refuses(by_hand(says), farthest + side * max(rounding, 1e-16), "expected")
 
 
 def test_the_message_s_other_signals_say_what_the_file_says() -> None:

@@ -11,7 +11,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Systematic, parse_bench, s
 from emb_runtime.errors import BenchFileError
 from emb_runtime.estimator.estimate import NO_FIT, by_name, total, words
 from emb_runtime.estimator.estimator import Estimator, estimated
-from emb_runtime.estimator.kalman import MISFIT, follow, start
+from emb_runtime.estimator.kalman import MISFIT, follow, initial_state
 from tests.benches import SENSOR_BENCH
 
 BENCH = SENSOR_BENCH
@@ -46,17 +46,17 @@ def test_it_takes_samples_and_begins_anew() -> None:
     fresh = estimator.state
     for sample in SAMPLES:
         before = estimator.state
-        estimator.take(*sample)
+        estimator.add_sample(*sample)
         assert estimator.state == follow(estimator.model, before, *sample)
     assert estimator.parameters is estimator.parameters is estimator.estimate  # computed once a sample
     assert estimator.parameters != Estimator(BENCH).estimate
     one = Estimator(one_bench := dataclasses.replace(BENCH, prior="viscous"))
     for sample in SAMPLES:
-        one.take(*sample)
+        one.add_sample(*sample)
     assert one.estimate[:3] == Estimator(one_bench).estimate[:3]
     assert one.estimate[4:7] == (0.0, 0.0, 0.0)
-    estimator.begin()
-    assert estimator.state == fresh == start(estimator.model)
+    estimator.begin_run()
+    assert estimator.state == fresh == initial_state(estimator.model)
     assert estimator.fits
     estimator.state = fresh._replace(worst=1.01 * MISFIT)
     assert not estimator.fits
@@ -64,7 +64,7 @@ def test_it_takes_samples_and_begins_anew() -> None:
 
 def test_an_estimate_that_is_not_finite_is_none() -> None:
     estimator = Estimator(BENCH)
-    estimator.take(math.nan, 0.0, 0.0, 0.0)
+    estimator.add_sample(math.nan, 0.0, 0.0, 0.0)
     assert estimator.estimate == ()
 
 

@@ -20,9 +20,9 @@ from emb_runtime.estimator.kalman import (
     believed,
     deviations,
     follow,
+    initial_state,
     make_model,
     predict,
-    start,
 )
 from tests.benches import SENSOR_BENCH
 
@@ -138,13 +138,13 @@ def test_with_a_declared_observer_the_angle_alone_corrects_whatever_the_velocity
         current = 6.0 if k < 30 else -6.0
         x, v = after(np.array([x, v, *UNIT]), current)[:2]
         samples.append((x + 1e-3 * rng.standard_normal(), current))
-    mean, p, squares = with_angles(start(OBSERVED), samples)
+    mean, p, squares = with_angles(initial_state(OBSERVED), samples)
     running, worst = 1.0, 1.0
     for square in squares:  # of one innovation a sample: the memory is as many innovations as with two
         running += (square - running) / 128.0
         worst = max(worst, running)
     for shown in (0.0, 300.0, -math.inf, math.nan):
-        state = start(OBSERVED)
+        state = initial_state(OBSERVED)
         for k, (angle, current) in enumerate(samples, 1):
             state = follow(OBSERVED, state, angle, shown, float(k), current)
         assert state.mean == pytest.approx(mean, rel=1e-6, abs=1e-9)
@@ -155,12 +155,12 @@ def test_with_a_declared_observer_the_angle_alone_corrects_whatever_the_velocity
 
 def test_the_prior_is_uniform_in_the_ranges_and_at_home() -> None:
     ranges = BENCH.range_set("viscous")
-    state = start(make_model(BENCH, ranges))
+    state = initial_state(make_model(BENCH, ranges))
     assert state.mean == pytest.approx((0.0, 0.0, 1.0, 1.0, 1.0, 3.0e-5 / 2.16e-5))
     deviation = np.array([0.5, 5.0, 0.0, 0.0, 0.0, 4.0e-5 / 2.16e-5 / math.sqrt(12.0)])
     assert unpack(np.array(state.covariance), 6) == pytest.approx(np.diag(deviation**2))
     assert (state.step, state.innovation, state.worst) == (0.0, 1.0, 1.0)
-    deviation = np.sqrt(np.diag(unpack(np.array(start(UNEQUAL).covariance), 6)))[2:]
+    deviation = np.sqrt(np.diag(unpack(np.array(initial_state(UNEQUAL).covariance), 6)))[2:]
     assert deviation == pytest.approx(np.subtract(UNEQUAL.high, UNEQUAL.low) / math.sqrt(12.0))
 
 
@@ -189,7 +189,7 @@ def test_lost_samples_leave_it_less_sure_by_the_currents_that_may_have_acted() -
     assert predict(EXACT, state, 0.5, 1.0) == predict(EXACT._replace(lost=0.0), state, 0.5, 1.0)
     for periods in (0.0, -3.0):
         assert predict(EXACT, state, periods, 6.0) == (state.mean, state.covariance)
-    late = follow(EXACT, start(EXACT), 0.5, 3.0, 40.0, 0.0)
+    late = follow(EXACT, initial_state(EXACT), 0.5, 3.0, 40.0, 0.0)
     assert late.mean[0] == pytest.approx(0.5, abs=2e-3)
 
 
@@ -211,14 +211,14 @@ def test_a_brake_that_surely_sticks_stands_still_and_tells_nothing_of_the_fricti
 
 
 def test_where_it_is_not_sure_whether_the_brake_sticks_it_stays_unsure() -> None:
-    state = before = follow(EXACT, start(EXACT), 0.0, 0.0, 0.0, 0.0)
+    state = before = follow(EXACT, initial_state(EXACT), 0.0, 0.0, 0.0, 0.0)
     for k in range(1, 40):
         state = follow(EXACT, state, 0.0, 0.0, float(k), EXACT.coulomb / EXACT.motor)  # breaks the nominal one away
     assert deviations(EXACT, state)[2] > 0.8 * deviations(EXACT, before)[2]
 
 
 def test_a_running_mean_of_the_innovations_is_kept_and_its_greatest_value_decides() -> None:
-    state = follow(EXACT, start(EXACT), 30.0, 0.0, 0.0, 0.0)  # 60 standard deviations from home
+    state = follow(EXACT, initial_state(EXACT), 30.0, 0.0, 0.0, 0.0)  # 60 standard deviations from home
     assert state.innovation > 20.0
     assert state.worst == state.innovation
     for _ in range(200):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from emb_bench.brake import euler
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.estimator.kalman import State, make_model, start
+from emb_runtime.estimator.kalman import State, initial_state, make_model
 from emb_runtime.estimator.speed_loop import current_for
 from tests.benches import SENSOR_BENCH
 
@@ -20,7 +20,7 @@ UNIT = (1.0, 1.0, 1.0, 1.0)
 
 
 def state_at(x: float, v: float, parameters: tuple[float, float, float, float] = UNIT) -> State:
-    return start(MODEL)._replace(mean=(x, v, *parameters))
+    return initial_state(MODEL)._replace(mean=(x, v, *parameters))
 
 
 @settings(max_examples=60, deadline=None)

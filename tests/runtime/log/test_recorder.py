@@ -121,7 +121,7 @@ def test_the_loss_of_the_drive_s_bus_costs_its_frames_and_not_the_log(
     monkeypatch.setattr(recorder_process, "SocketCan", Bus)
     path, ring = tmp_path / "run.mcap", Ring.create(16)
     header = to_builtins(replace(HEADER, drive_bus="can0"), str_keys=True)
-    recording = recorder_process.begin(ring, {"path": str(path), "parent": 0, "header": header})
+    recording = recorder_process.begin_recording(ring, {"path": str(path), "parent": 0, "header": header})
     commands = iter((None, None, {"exit_reason": "BUS_LOST"}))
 
     def listen(_wait: float) -> dict[str, str] | None:
@@ -209,7 +209,9 @@ def test_whatever_writing_raises_the_run_is_told(
 ) -> None:
     ring = Ring.create(16)
     header = to_builtins(HEADER, str_keys=True)
-    recording = recorder_process.begin(ring, {"path": str(tmp_path / "run.mcap"), "parent": 0, "header": header})
+    recording = recorder_process.begin_recording(
+        ring, {"path": str(tmp_path / "run.mcap"), "parent": 0, "header": header}
+    )
 
     def fail(*_: object, **__: object) -> None:
         raise kind("planted")
@@ -229,7 +231,9 @@ def test_what_the_first_chunk_raises_is_told_before_the_run_and_no_file_stays(
     monkeypatch.setattr(recorder_process.LogWriter, "flush", fail)
     header = to_builtins(HEADER, str_keys=True)
     with pytest.raises(LogError, match="ZstdError: planted; the file was begun, and is removed"):
-        recorder_process.begin(Ring.create(16), {"path": str(tmp_path / "run.mcap"), "parent": 0, "header": header})
+        recorder_process.begin_recording(
+            Ring.create(16), {"path": str(tmp_path / "run.mcap"), "parent": 0, "header": header}
+        )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -394,7 +398,7 @@ class Waiting:
 
     def tell(self, trailer: object) -> None: ...
 
-    def answer(self, timeout: float) -> dict[str, Any]:
+    def read_answer(self, timeout: float) -> dict[str, Any]:
         self.waited = timeout
         return {}
 

@@ -223,7 +223,7 @@ def test_angle_velocity_and_time_reach_the_graph_and_the_estimate_where_it_asks_
         ), weights
 
     estimator = Estimator(BENCH)
-    estimator.take(0.1, 20.0, 0, 0.0)
+    estimator.add_sample(0.1, 20.0, 0, 0.0)
     model, state = estimator.model, estimator.state
     for inputs in INPUTS:
         for kind in UNITS:

@@ -22,7 +22,7 @@ from emb_runtime.safety.motion_balance import (
     MotionBalance,
     State,
     balance_model,
-    begin,
+    begin_balance,
     origin,
     solve,
     steady_motion,
@@ -143,7 +143,7 @@ class Reference:
 
 def taken(bench: Bench, rows: list[Row]) -> tuple[State, list[int]]:
     """The state after all rows, and the samples with which an entry was made."""
-    model, state = balance_model(bench), begin(rows[0].angle, rows[0].velocity)
+    model, state = balance_model(bench), begin_balance(rows[0].angle, rows[0].velocity)
     entries = []
     for k, row in enumerate(rows[1:], 1):
         state = take(model, state, *row)
@@ -219,7 +219,7 @@ EDGES = {
 def test_the_edges_of_a_period_that_counts() -> None:
     model = balance_model(BENCH)
     for velocities, counts in EDGES.items():
-        state = begin(0.0, velocities[0])
+        state = begin_balance(0.0, velocities[0])
         for _ in range(2):
             state = take(model, state, True, 0.0, velocities[0], 1.0)
         assert take(model, state, True, 0.0, velocities[1], 1.0).periods - state.periods == counts, velocities
@@ -270,7 +270,7 @@ def feed(balance: MotionBalance, rows: Iterator[Row]) -> None:
 def test_an_honest_run_is_explained_and_a_gain_that_changes_ends_it_with_the_next_entry() -> None:
     honest = played(BENCH, 6, 500, lost=0.0)
     balance, first, rows = MotionBalance(BENCH), *split(honest)
-    balance.begin(first)
+    balance.begin_run(first)
     feed(balance, rows)
     found, most = balance.judge()
     reference = Reference(BENCH, honest)
@@ -278,7 +278,7 @@ def test_an_honest_run_is_explained_and_a_gain_that_changes_ends_it_with_the_nex
     assert most == pytest.approx(reference.allowed(), rel=1e-7)
     assert 0.0 < found < 0.7 * most
     first, rows = split(played(BENCH, 6, 500, gain=1.4, lost=0.0))
-    balance.begin(first)
+    balance.begin_run(first)
     with pytest.raises(StopError) as stopped:
         feed(balance, rows)
     left = len(list(rows))
@@ -287,7 +287,7 @@ def test_an_honest_run_is_explained_and_a_gain_that_changes_ends_it_with_the_nex
     assert stopped.value.fault is Fault.MOTION_UNEXPLAINED
     said = [float(word) for word in stopped.value.detail.split() if word.isdigit()]
     assert said[0] > said[1] > 25.0
-    balance.begin(first)
+    balance.begin_run(first)
     assert balance.judge() == (0.0, math.inf)
 
 
@@ -381,7 +381,7 @@ def run(bench: Bench, zero: float, seed: int = 1, samples: int = 500) -> MotionB
     bench = replace(bench, limits=replace(bench.limits, velocity=2000.0))
     draw, b, t = Random(seed), bench.brake, bench.timing.sample_time
     balance, x, v, u = MotionBalance(bench), zero, 0.0, 0.0
-    balance.begin(sample(Row(True, 0.0, 0.0, 0.0)))
+    balance.begin_run(sample(Row(True, 0.0, 0.0, 0.0)))
     for k in range(samples):
         u = (4.0 if k % 200 < 100 else -4.0) + draw.uniform(-1.0, 1.0)
         drive = 0.9 * b.k_m * u - 1.1 * b.gamma * b.k_1 * max(x, 0.0) - 0.8 * b.f_v * v
@@ -408,7 +408,7 @@ def test_what_is_not_judged_by_the_balance_has_no_origin_to_judge(bench: Bench) 
     lagging = replace(bench, shield=bench.shield._replace(current_lag=0.0005))
     run(lagging, 6.0).judge_zero()
     few = MotionBalance(bench)
-    few.begin(sample(Row(True, 0.0, 0.0, 0.0)))
+    few.begin_run(sample(Row(True, 0.0, 0.0, 0.0)))
     few.judge_zero()
 
 

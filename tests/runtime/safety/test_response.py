@@ -18,8 +18,8 @@ from emb_runtime.safety.response import (
     OPEN,
     PROVEN,
     Row,
-    begin,
-    fits,
+    begin_response,
+    explains,
     overshoot,
     response_model,
     take,
@@ -89,7 +89,7 @@ def moved(
 def judged(bench: Bench, rows: Sequence[Row]) -> tuple[int, int]:
     """First verdict that is not open, and after how many samples."""
     model = response_model(bench, make_law(bench))
-    state = begin(model, rows[0].angle, rows[0].velocity)
+    state = begin_response(model, rows[0].angle, rows[0].velocity)
     for k, row in enumerate(rows[1:], 1):
         state, verdict = take(model, state, *row)
         if verdict != OPEN:
@@ -99,7 +99,7 @@ def judged(bench: Bench, rows: Sequence[Row]) -> tuple[int, int]:
 
 def test_the_estimate_is_that_of_least_squares_with_a_prior() -> None:
     rows = moved([6.0] * 6 + [5.0] * 6 + [3.0] * 6, late=1, noise=4)
-    state = begin(MODEL, rows[0].angle, rows[0].velocity)
+    state = begin_response(MODEL, rows[0].angle, rows[0].velocity)
     unknown = np.array([rows[0].velocity, *MODEL.prior, 0.0])
     deviations = np.array([MODEL.deviation, *MODEL.deviations, MODEL.widest])
     lines, measured = [np.diag(1.0 / deviations)], [unknown / deviations]
@@ -330,8 +330,8 @@ def test_a_sample_that_does_not_follow_begins_the_observer_anew() -> None:
 
 
 def test_a_filter_whose_innovations_are_too_large_does_not_fit() -> None:
-    state = begin(MODEL, 0.0, 0.0)
-    assert fits(MODEL, state)
+    state = begin_response(MODEL, 0.0, 0.0)
+    assert explains(MODEL, state)
     for k in range(12):
         state, _ = take(MODEL, state, True, 0.0, 40.0 * (-1.0) ** k + 60.0, 0.0)
-    assert not fits(MODEL, state)
+    assert not explains(MODEL, state)

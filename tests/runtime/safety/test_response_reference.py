@@ -26,7 +26,7 @@ from emb_runtime.safety.response import (
     ResponseModel,
     Row,
     State,
-    begin,
+    begin_response,
     overshoot,
     response_model,
     take,
@@ -210,7 +210,7 @@ def test_filter_and_verdicts_are_those_of_the_page(seed: int) -> None:
     dice = Random(seed)
     model = drawn_model(dice)
     angle, velocity = dice.uniform(-2.0, 2.0), dice.uniform(-9.0, 9.0)
-    state, reference = begin(model, angle, velocity), Reference(model, angle, velocity)
+    state, reference = begin_response(model, angle, velocity), Reference(model, angle, velocity)
     for row in samples(dice, model):
         expected = reference.take(*row)
         state, found = take(model, state, *row)
@@ -253,7 +253,7 @@ NEAT = response_model(BENCH, SHIPPED)._replace(
     sample_time=2.0**-10, current=8.0, extra=0.0, transient=0.0, early=0.0, deviation=1.0, slides=8.0,
     box=SHIPPED.box._replace(motor_low=1000.0, motor_high=2000.0),
 )  # fmt: skip
-EXACT: State = begin(NEAT._replace(deviation=0.0, deviations=(0.0, 0.0, 0.0, 0.0), widest=0.0), 0.0, 100.0)
+EXACT: State = begin_response(NEAT._replace(deviation=0.0, deviations=(0.0, 0.0, 0.0, 0.0), widest=0.0), 0.0, 100.0)
 KNOWN = {"overshoot": 0.0, "largest": 8.0, "motor": 1500.0, "slides": 1.0, "misfit": 0.0, "age": 0}
 
 
@@ -320,25 +320,27 @@ def test_a_run_has_the_slow_law_until_its_response_is_proven_and_again_in_the_ne
     first = sample(Row(False, 0.0, 0.0, 0.0))
     assert (response.law, response.rows, response.proven) == (slow, [], False)
     for _ in range(2):
-        response.begin(first)
+        response.begin_run(first)
         assert (response.law, response.proven) == (slow, False)
         for row in sliding(0):
             if not response.proven:
                 assert response.law == slow
-                response.take(sample(row), row.follows, row.command)
+                response.add_sample(sample(row), row.follows, row.command)
         assert response.proven
         assert response.law == SHIPPED
         assert response.rows == [Row(False, 0.0, 0.0, 0.0), *sliding(0)[: len(response.rows) - 1]]
-        assert response.text.startswith("the velocity follows the commands 0.0 ± 0.")
-        assert response.text.endswith(" samples late, at most 0 are declared")
+        assert response.description.startswith("the velocity follows the commands 0.0 ± 0.")
+        assert response.description.endswith(" samples late, at most 0 are declared")
 
 
 def test_a_delay_that_is_negative_by_less_than_is_told_has_no_sign() -> None:
     response, dice = Response(BENCH, SHIPPED), Random(2)
-    response.begin(sample(Row(False, 0.0, 0.0, 0.0)))
+    response.begin_run(sample(Row(False, 0.0, 0.0, 0.0)))
     for row in sliding(0)[:12]:
-        response.take(sample(row._replace(velocity=row.velocity + dice.gauss(0.0, 0.5))), row.follows, row.command)
-    assert response.text.startswith("the velocity follows the commands 0.0 ± 0.")
+        response.add_sample(
+            sample(row._replace(velocity=row.velocity + dice.gauss(0.0, 0.5))), row.follows, row.command
+        )
+    assert response.description.startswith("the velocity follows the commands 0.0 ± 0.")
 
 
 def told(text: str) -> tuple[float, float, float]:
@@ -352,13 +354,13 @@ def told(text: str) -> tuple[float, float, float]:
 
 def test_a_late_response_ends_the_run_with_the_samples_that_show_it() -> None:
     response, rows = Response(BENCH, SHIPPED), sliding(2)
-    response.begin(sample(Row(False, 0.0, 0.0, 0.0)))
-    response.take(sample(rows[0]), True, 6.0)
-    response.take(sample(rows[1]), True, 6.0)
+    response.begin_run(sample(Row(False, 0.0, 0.0, 0.0)))
+    response.add_sample(sample(rows[0]), True, 6.0)
+    response.add_sample(sample(rows[1]), True, 6.0)
     with pytest.raises(StopError) as stop:
-        response.take(sample(rows[2]), True, 6.0)
-    assert (stop.value.fault, stop.value.detail) == (Fault.RESPONSE_LATE, response.text)
-    assert told(response.text)[0] > 1.0
+        response.add_sample(sample(rows[2]), True, 6.0)
+    assert (stop.value.fault, stop.value.detail) == (Fault.RESPONSE_LATE, response.description)
+    assert told(response.description)[0] > 1.0
     assert response.law == unproven_law(BENCH, SHIPPED)
     assert response.rows == [Row(False, 0.0, 0.0, 0.0), *rows[:3]]
 
@@ -370,10 +372,10 @@ def test_the_delay_that_is_told_is_known_once_the_current_has_changed(
 ) -> None:
     bench = replace(BENCH, shield=BENCH.shield._replace(frame_age=(1, 3)))
     response = Response(bench, make_law(bench))
-    response.begin(sample(Row(False, 0.0, 0.0, 0.0)))
+    response.begin_run(sample(Row(False, 0.0, 0.0, 0.0)))
     for row in sliding(late)[:after]:
-        response.take(sample(row), row.follows, row.command)
-    found, error, declared = told(response.text)
+        response.add_sample(sample(row), row.follows, row.command)
+    found, error, declared = told(response.description)
     assert found == pytest.approx(late, abs=most)
     assert declared == 3.0
     assert least <= error < most
@@ -381,22 +383,22 @@ def test_the_delay_that_is_told_is_known_once_the_current_has_changed(
 
 def test_once_proven_the_samples_are_only_kept() -> None:
     response = Response(BENCH, SHIPPED)
-    response.begin(sample(Row(False, 0.0, 0.0, 0.0)))
+    response.begin_run(sample(Row(False, 0.0, 0.0, 0.0)))
     rows = iter(sliding(0))
     while not response.proven:
-        response.take(sample(row := next(rows)), row.follows, row.command)
-    told, still = response.text, Row(True, 1.0, 0.0, 6.0)
+        response.add_sample(sample(row := next(rows)), row.follows, row.command)
+    told, still = response.description, Row(True, 1.0, 0.0, 6.0)
     for _ in range(20):
-        response.take(sample(still), True, 6.0)
-    assert (response.proven, response.text, response.rows[-1]) == (True, told, still)
+        response.add_sample(sample(still), True, 6.0)
+    assert (response.proven, response.description, response.rows[-1]) == (True, told, still)
 
 
 def test_the_newest_samples_of_a_run_and_the_first_of_its_stop_are_kept() -> None:
     response = Response(BENCH, SHIPPED)
-    response.begin(sample(Row(False, 0.0, 0.0, 0.0)))
+    response.begin_run(sample(Row(False, 0.0, 0.0, 0.0)))
     for k in range(80):
         row = Row(True, 1e-3 * k, 0.0, 0.0)
-        response.take(sample(row)._replace(counter=4), True, 0.0)
+        response.add_sample(sample(row)._replace(counter=4), True, 0.0)
         assert len(response.rows) == min(k + 2, 32)
         assert response.rows[-1] == row
     rows = []

@@ -20,7 +20,7 @@ from emb_runtime.safety.sensor_monitor import (
     OUTSIDE_SET,
     REVERSED,
     SensorMonitor,
-    begin,
+    begin_monitor,
     judge,
     largest_current,
 )
@@ -39,7 +39,7 @@ TS = 1e-3
 
 @pytest.mark.parametrize("elapsed", [math.nan, math.inf, -math.inf, 0.0, -TS, 1e9])
 def test_a_time_that_is_none_contradicts(elapsed: float) -> None:
-    assert judge(LAW, LIMITS, begin(0.0, 0.0), elapsed, 0.0, 0.0, True, 0.0, 0.0)[1] == CONTRADICTING
+    assert judge(LAW, LIMITS, begin_monitor(0.0, 0.0), elapsed, 0.0, 0.0, True, 0.0, 0.0)[1] == CONTRADICTING
 
 
 def numbers(state: Any) -> list[float]:
@@ -54,7 +54,7 @@ wild = st.floats(-1e6, 1e6) | st.floats(-10.0, 10.0)
 def test_whatever_comes_the_state_stays_finite(
     samples: list[tuple[float, float, float, bool, float, float]],
 ) -> None:
-    state = begin(0.0, 0.0)
+    state = begin_monitor(0.0, 0.0)
     for elapsed, angle, velocity, obeyed, command, reported in samples:
         state, verdict = judge(LAW, LIMITS, state, elapsed, angle, velocity, obeyed, command, reported)
         assert verdict in (HONEST, CONTRADICTING, OUTSIDE_SET, REVERSED)
@@ -79,14 +79,14 @@ def test_at_rest_at_the_origin_the_first_move_is_the_full_current_and_far_from_i
         (0.0, 100.0, 0.0),  # what moves fast is left to friction, with either sign
         (0.0, -100.0, 0.0),
     ):
-        monitor.begin(sample(angle, velocity))
+        monitor.begin_run(sample(angle, velocity))
         assert monitor.largest_current(6.0) == most
-    monitor.begin(sample(0.0, 60.0))
+    monitor.begin_run(sample(0.0, 60.0))
     assert 0.0 < monitor.largest_current(6.0) < LIMITS.first_current
 
 
 def test_once_the_motion_has_shown_its_sign_nothing_is_limited() -> None:
-    state = begin(50.0, 300.0)
+    state = begin_monitor(50.0, 300.0)
     assert largest_current(LAW, LIMITS, state, 6.0) == LIMITS.first_current
     state = state._replace(obeys=True)
     assert largest_current(LAW, LIMITS, state, 6.0) == 6.0
@@ -96,7 +96,7 @@ def test_once_the_motion_has_shown_its_sign_nothing_is_limited() -> None:
 def test_friction_is_waited_for_where_the_motion_has_not_shown_its_sign() -> None:
     for shown in (False, True):
         monitor = SensorMonitor(LAW, LIMITS)
-        monitor.begin(sample(0.0, 0.0))
+        monitor.begin_run(sample(0.0, 0.0))
         if shown:
             v = TS * (6.0 * BENCH.brake.k_m - BENCH.brake.T_c) / BENCH.brake.J
             x = 0.5 * TS * v
@@ -108,20 +108,20 @@ def test_friction_is_waited_for_where_the_motion_has_not_shown_its_sign() -> Non
 
 def test_a_run_begins_where_its_first_sample_lies() -> None:
     monitor = SensorMonitor(LAW, LIMITS)
-    monitor.begin(sample(3.0, 0.0))
+    monitor.begin_run(sample(3.0, 0.0))
     monitor.check(TS, sample(3.0, 0.0), False, 0.0)
-    monitor.begin(sample(-3.0, 0.0))
+    monitor.begin_run(sample(-3.0, 0.0))
     monitor.check(TS, sample(-3.0, 0.0), False, 0.0)
 
 
 def test_friction_is_waited_for_up_to_the_speed_that_the_page_gives() -> None:
     monitor = SensorMonitor(LAW, LIMITS)
-    monitor.begin(sample(0.0, 0.0))
+    monitor.begin_run(sample(0.0, 0.0))
     assert monitor.coasting_time(sample(0.1, 126.41)) > 0.0
     assert monitor.coasting_time(sample(0.1, 126.71)) == 0.0
 
 
 def test_a_monitor_that_has_heard_nothing_limits_the_first_move_already() -> None:
     fresh, begun = SensorMonitor(LAW, LIMITS), SensorMonitor(LAW, LIMITS)
-    begun.begin(sample(0.0, 0.0))
+    begun.begin_run(sample(0.0, 0.0))
     assert fresh.largest_current(100.0) == begun.largest_current(100.0) < 20.0

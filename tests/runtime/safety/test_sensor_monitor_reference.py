@@ -26,7 +26,7 @@ from emb_runtime.safety.sensor_monitor import (
     Currents,
     SensorMonitor,
     State,
-    begin,
+    begin_monitor,
     coasting_time,
     judge,
     largest_current,
@@ -282,7 +282,7 @@ def test_verdicts_and_sums_are_those_of_the_page() -> None:
         for _ in range(6):
             law, limits = drawn_law(rng), drawn_limits(rng)
             start = rng.uniform(-1.0, 1.0), rng.uniform(-3.0, 3.0)
-            reference, state = Reference(law, limits, *start), begin(*start)
+            reference, state = Reference(law, limits, *start), begin_monitor(*start)
             for s in drawn_samples(rng, law, 60):
                 expected = reference.judge(s)
                 seen[expected] += 1
@@ -299,7 +299,7 @@ def test_verdicts_and_sums_are_those_of_the_page() -> None:
 def state_after(law: ShieldLaw, samples: Iterable[Sample], limits: SensorThresholds, confirmed: bool = False) -> Run:
     """The state before the last sample, and that sample."""
     *before, last = samples
-    state = begin(0.0, 0.0)._replace(confirmed=confirmed)
+    state = begin_monitor(0.0, 0.0)._replace(confirmed=confirmed)
     for s in before:
         state, _ = judge(law, limits, state, *s)
     return state, last
@@ -388,7 +388,7 @@ def test_the_opposite_sign_of_the_angle_fits_if_the_velocity_says_half_the_thres
     integral = 2.0**-10
     sample = Sample(2.0**-10, -1.5 * integral, 2.0, True, 0.0, 0.0)
     limits = SILENT._replace(offset=0.0, travel=travel * integral)
-    assert judge(law, limits, begin(0.0, 0.0), *sample)[1] == expected
+    assert judge(law, limits, begin_monitor(0.0, 0.0), *sample)[1] == expected
 
 
 def test_a_travel_of_exactly_zero_begins_anew() -> None:
@@ -396,7 +396,7 @@ def test_a_travel_of_exactly_zero_begins_anew() -> None:
     law = SHIPPED._replace(sample_time=ts)
     limits = SILENT._replace(offset=0.0, lag=0.5, lead=0.5)
     for sign in (-1.0, 1.0):
-        state = begin(0.0, 0.0)._replace(confirmed=True)
+        state = begin_monitor(0.0, 0.0)._replace(confirmed=True)
         state, first = judge(law, limits, state, *Sample(ts, 4.0 * ts, 8.0, True, 0.0, 0.0))  # excess 0 at 8 rad/s
         assert first == HONEST
         thrown = Sample(ts, 12.0 * ts + sign, 8.0, True, 0.0, 0.0)  # 1 rad off, with no velocity gained since
@@ -413,18 +413,18 @@ def test_numbers_count_up_to_a_million(place: int, sign: float) -> None:
         numbers = [0.0, 0.0, 0.0, 0.0]
         numbers[place] = sign * size
         angle, velocity, command, reported = numbers
-        state, verdict = judge(SHIPPED, SILENT, begin(0.0, 0.0), 1e-3, angle, velocity, True, command, reported)
+        state, verdict = judge(SHIPPED, SILENT, begin_monitor(0.0, 0.0), 1e-3, angle, velocity, True, command, reported)
         assert (verdict == CONTRADICTING) == (not size <= 1e6)
         return state
 
     for none in (math.nextafter(1e6, math.inf), math.inf, math.nan):
-        assert state_of(none) == begin(0.0, 0.0)
-    assert state_of(1e6) != begin(0.0, 0.0)
+        assert state_of(none) == begin_monitor(0.0, 0.0)
+    assert state_of(1e6) != begin_monitor(0.0, 0.0)
 
 
 def test_a_sample_time_counts_up_to_a_million_seconds() -> None:
     for elapsed, expected in ((1e6, HONEST), (math.nextafter(1e6, math.inf), CONTRADICTING)):
-        assert judge(SHIPPED, SILENT, begin(0.0, 0.0), elapsed, 0.0, 0.0, True, 0.0, 0.0)[1] == expected
+        assert judge(SHIPPED, SILENT, begin_monitor(0.0, 0.0), elapsed, 0.0, 0.0, True, 0.0, 0.0)[1] == expected
 
 
 # --- thresholds, coasting, faults -------------------------------------------------------------------------------------
@@ -487,7 +487,7 @@ def test_friction_alone_stops_a_brake_within_the_free_stroke_and_what_the_spring
 
 def stopped(limits: SensorThresholds, run: Iterable[Sample], law: ShieldLaw = SHIPPED) -> StopError:
     monitor = SensorMonitor(law, limits)
-    monitor.begin(SensorSample(0, 0.0, 0.0, 0, 0, 0.0, 15, NodeState.ACTIVE))
+    monitor.begin_run(SensorSample(0, 0.0, 0.0, 0, 0, 0.0, 15, NodeState.ACTIVE))
 
     def go() -> None:
         for s in run:
@@ -520,7 +520,7 @@ def test_each_fault_tells_the_sum_and_the_threshold_that_it_passed(sign: float) 
     assert caught.detail == told
 
     at_it = [Sample(1e-3, sign * 0.525, sign * 50.0, True, 0.0, 0.0)]
-    state, _ = judge(SHIPPED, SILENT, begin(0.0, 0.0), *at_it[0])
+    state, _ = judge(SHIPPED, SILENT, begin_monitor(0.0, 0.0), *at_it[0])
     exactly = limits._replace(motion=max(state.motion))
     assert stopped(exactly, at_it).detail.startswith("the angle is 0.50 rad beyond")
 
@@ -532,7 +532,7 @@ def test_the_reported_current_of_the_sample_is_the_one_that_counts(reported: flo
     frozen = Sample(1e-3, 0.0, 0.0, True, 3.0, reported)
     first = next(k for k in range(100) if reference.judge(frozen) != HONEST)
     monitor = SensorMonitor(SHIPPED, limits)
-    monitor.begin(SensorSample(0, 0.0, 0.0, 0, 0, 0.0, 15, NodeState.ACTIVE))
+    monitor.begin_run(SensorSample(0, 0.0, 0.0, 0, 0, 0.0, 15, NodeState.ACTIVE))
     told = SensorSample(0, 0.0, 0.0, 0, 0, reported, 15, NodeState.ACTIVE)
     for _ in range(first):
         monitor.check(1e-3, told, True, 3.0)
@@ -580,7 +580,7 @@ def test_the_first_move_is_what_friction_stops_by_the_page() -> None:
     rng, beyond, below = Random(0), 0, 0
     for _ in range(4000):
         law, limits = drawn_law(rng), drawn_limits(rng)
-        state = begin(rng.uniform(-1.0, 1.0) * rng.choice([0.5, 6.0]), rng.gauss(0.0, 10.0))
+        state = begin_monitor(rng.uniform(-1.0, 1.0) * rng.choice([0.5, 6.0]), rng.gauss(0.0, 10.0))
         pairs = [sorted(rng.choice([0.0, 1.0]) * rng.gauss(0.0, 1.0) for _ in "ab") for _ in NO_CURRENTS]
         lows, highs = zip(*pairs, strict=True)
         state = state._replace(lows=cast(Currents, lows), highs=cast(Currents, highs))
@@ -601,17 +601,19 @@ def test_the_first_move_is_more_than_gentle_up_to_where_half_of_the_friction_hol
         SHIPPED, friction_low=1024.0, spring_high=128.0, angle_noise=0.0, sample_time=2.0**-10, bottom=-5.875
     )  # half of the friction holds 4 rad, and friction stops 64 rad/s within the 2 rad from 3.875 to 5.875
     limits = sensor_thresholds(BENCH, law)._replace(first_current=0.25)
-    assert largest_current(law, limits, begin(3.875, 0.0), 100.0) > 0.25  # and 64 rad/s for two periods are 0.125 rad
+    assert (
+        largest_current(law, limits, begin_monitor(3.875, 0.0), 100.0) > 0.25
+    )  # and 64 rad/s for two periods are 0.125 rad
     for angle in (3.876, -3.876, 5.875, 50.0):
-        assert largest_current(law, limits, begin(angle, 0.0), 100.0) == 0.25
+        assert largest_current(law, limits, begin_monitor(angle, 0.0), 100.0) == 0.25
     short = law._replace(bottom=-1.0)
     for angle in (1.0, 1.5, 50.0):
-        assert largest_current(short, limits, begin(angle, 0.0), 100.0) == 0.25
+        assert largest_current(short, limits, begin_monitor(angle, 0.0), 100.0) == 0.25
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_what_may_be_at_rest_by_the_noise_may_be_moved_and_what_is_faster_is_left_to_friction(sign: float) -> None:
     limits = sensor_thresholds(BENCH, SHIPPED)._replace(first_current=1e3)
     fastest = SHIPPED.velocity_noise
-    assert largest_current(SHIPPED, limits, begin(0.0, sign * fastest), 1e6) == 1e3
-    assert largest_current(SHIPPED, limits, begin(0.0, sign * math.nextafter(fastest, math.inf)), 1e6) < 1e3
+    assert largest_current(SHIPPED, limits, begin_monitor(0.0, sign * fastest), 1e6) == 1e3
+    assert largest_current(SHIPPED, limits, begin_monitor(0.0, sign * math.nextafter(fastest, math.inf)), 1e6) < 1e3

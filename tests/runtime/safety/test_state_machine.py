@@ -20,7 +20,7 @@ from emb_runtime.safety.state_machine import (
     StopError,
     may_enable,
     may_send,
-    step,
+    next_run,
 )
 
 MS = 1_000_000
@@ -47,9 +47,9 @@ def test_every_transition_is_the_one_in_the_picture(row: str) -> None:
     for event, target in zip([*Event, Fault.INTERRUPTED, Fault.BUS_ERRORS], targets, strict=True):
         if target == "-":
             with pytest.raises(ValueError, match=f"{event.name} cannot happen in {name}"):
-                step(run, event, 101 * MS)
+                next_run(run, event, 101 * MS)
             continue
-        after = step(run, event, 101 * MS)
+        after = next_run(run, event, 101 * MS)
         assert after.state is (run.state if target == "=" else RunState[target])
         assert after.since_ns == (100 * MS if target == "=" else 101 * MS)
 
@@ -72,7 +72,7 @@ def test_whatever_happens_a_fault_stays_and_only_stopping_follows_what_may_have_
     for event, waited_ns in events:
         now_ns += waited_ns
         try:
-            after = step(run, event, now_ns)
+            after = next_run(run, event, now_ns)
         except ValueError:
             continue
         assert run.fault is None or after.fault is run.fault

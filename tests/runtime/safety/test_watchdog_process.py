@@ -125,8 +125,8 @@ def test_memory_that_is_no_heartbeat_is_refused(memory: bytes) -> None:
 def looks(watch: SilenceMonitor, *times_ns: int, beat_ns: int) -> LoopStatus:
     """The verdict at the last of these times; it was ALIVE at all others."""
     for time_ns in times_ns[:-1]:
-        assert watch.step(time_ns, beat_ns, armed=True, gone=False) is LoopStatus.ALIVE
-    return watch.step(times_ns[-1], beat_ns, armed=True, gone=False)
+        assert watch.look(time_ns, beat_ns, armed=True, gone=False) is LoopStatus.ALIVE
+    return watch.look(times_ns[-1], beat_ns, armed=True, gone=False)
 
 
 ON_SCHEDULE = [START + k * MS for k in range(1, 5)]
@@ -142,7 +142,7 @@ def test_a_silence_of_the_heartbeat_trips_and_one_nanosecond_less_does_not() -> 
 def test_whoever_is_not_armed_may_be_silent_and_is_judged_from_the_arming_on() -> None:
     watch = SilenceMonitor(HEARTBEAT, START)
     for k in range(1, 100):
-        assert watch.step(START + k * MS, START, armed=False, gone=False) is LoopStatus.ALIVE
+        assert watch.look(START + k * MS, START, armed=False, gone=False) is LoopStatus.ALIVE
     last = START + 99 * MS
     # The beat that comes with the arming may be seen after it.
     silence = [last + k * MS for k in range(1, 5)]
@@ -151,13 +151,13 @@ def test_whoever_is_not_armed_may_be_silent_and_is_judged_from_the_arming_on() -
 
 
 def test_a_beat_from_the_future_is_none() -> None:
-    assert SilenceMonitor(HEARTBEAT, START).step(START, START, armed=True, gone=False) is LoopStatus.ALIVE
-    assert SilenceMonitor(HEARTBEAT, START).step(START, START + 1, armed=True, gone=False) is LoopStatus.STALLED
+    assert SilenceMonitor(HEARTBEAT, START).look(START, START, armed=True, gone=False) is LoopStatus.ALIVE
+    assert SilenceMonitor(HEARTBEAT, START).look(START, START + 1, armed=True, gone=False) is LoopStatus.STALLED
 
 
 @pytest.mark.parametrize(("armed", "status"), [(True, LoopStatus.GONE), (False, LoopStatus.OVER)])
 def test_a_loop_that_is_gone_was_to_be_watched_or_had_ended(armed: bool, status: LoopStatus) -> None:
-    assert SilenceMonitor(HEARTBEAT, START).step(START, START, armed, gone=True) is status
+    assert SilenceMonitor(HEARTBEAT, START).look(START, START, armed, gone=True) is status
 
 
 def test_two_intervals_between_two_looks_are_on_schedule_and_more_is_stolen() -> None:
@@ -220,7 +220,7 @@ def test_it_trips_between_one_and_two_heartbeats_of_silence_and_on_schedule_afte
         if beats:
             beat = now - min(gap, MS // 3)
         silence = now - beat
-        status = watch.step(now, beat, armed=True, gone=False)
+        status = watch.look(now, beat, armed=True, gone=False)
         if silence < HEARTBEAT:
             assert status is LoopStatus.ALIVE
         elif on_schedule or silence >= 2 * HEARTBEAT:
