@@ -262,17 +262,18 @@ def test_calls_that_do_not_fit_the_experiments_are_refused() -> None:
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 def test_a_copy_of_an_environment_goes_on_as_the_original_does(copied: Callable[[Any], Any]) -> None:
-    for env in (EmbExcitationEnv(bench=SHORT, conditions=FOLLOWED), EmbExcitationVectorEnv(2, SHORT)):
+    envs: list[tuple[Any, tuple[int, ...], int]] = [
+        (EmbExcitationEnv(bench=SHORT, conditions=FOLLOWED), (1,), 60),
+        (EmbExcitationVectorEnv(2, SHORT), (2, 1), 90),  # which begin again by themselves
+    ]
+    for env, shape, count in envs:
         env.reset(seed=3)
-        for k, action in enumerate(actions(4, 90)):
-            if k == 60 and isinstance(env, EmbExcitationEnv):
-                break  # the other one begins again by itself
-            if k == 20:
-                other = copied(env)
-            full = np.full(env.action_space.shape or (), action)
-            made = env.step(full)
-            if k >= 20:
-                np.testing.assert_equal(other.step(full), made)
+        steps = [np.full(shape, action) for action in actions(4, count)]
+        for step in steps[:20]:
+            env.step(step)
+        other = copied(env)
+        for step in steps[20:]:
+            np.testing.assert_equal(other.step(step), env.step(step))
 
 
 def test_without_a_shield_an_action_is_clipped_and_leaving_the_limits_ends_the_experiment_with_the_penalty() -> None:
