@@ -68,12 +68,12 @@ def numpy_learn(
     root = np.sqrt([w1, w2])
     for current in u:
         spring = np.where(x1 >= 0.0, p.gamma * p.k_1, 0.0)
-        own = np.stack([p.k_m * current, -spring * x1, -p.T_c * np.sign(x2), -p.f_v * x2], axis=1)
-        change = own - spring[:, None] * s[:, :, 0] - p.f_v * s[:, :, 1]
+        torques = np.stack([p.k_m * current, -spring * x1, -p.T_c * np.sign(x2), -p.f_v * x2], axis=1)
+        change = torques - spring[:, None] * s[:, :, 0] - p.f_v * s[:, :, 1]
         s[:, :, 0] += t_s * s[:, :, 1]
         s[:, :, 1] += t_s / p.J * change
         x1 += t_s * x2
-        x2 += t_s / p.J * own.sum(axis=1)
+        x2 += t_s / p.J * torques.sum(axis=1)
         scaled = s * root
         m += scaled @ scaled.transpose(0, 2, 1)
 
@@ -128,7 +128,7 @@ def learn_batch(
     p: BrakeParameters,
     u: Any,
     t_s: float,
-    chosen: Any,
+    unknowns: Any,
     x: Any,
     s: Any,
     m: Any,
@@ -138,7 +138,7 @@ def learn_batch(
     """Many brakes of any kind, each through all its steps, with sensitivities and packed FIM."""
     for e in numba.prange(x.shape[0]):
         for k in range(u.shape[1]):
-            advance(mechanics, p, x[e], u[e, k], t_s, chosen, s[e])
+            advance(mechanics, p, x[e], u[e, k], t_s, unknowns, s[e])
             add_increment(m[e], s[e], w1, w2)
 
 
@@ -146,8 +146,8 @@ def solve(p: BrakeParameters, u: Floats, t_s: float) -> Floats:
     """Rival: one brake through its steps by a general solver that looks for events; states at the samples."""
     state, states = np.zeros(2), []
     for current in u:
-        left = t_s
-        while left > 0.0:
+        remaining = t_s
+        while remaining > 0.0:
             pull = p.k_m * current - p.gamma * p.k_1 * max(state[0], 0.0)
             if state[1] == 0.0 and abs(pull) <= p.T_c:
                 break
@@ -161,8 +161,8 @@ def solve(p: BrakeParameters, u: Floats, t_s: float) -> Floats:
                 return float(y[1] * d)
 
             rest.terminal, rest.direction = True, -1  # type: ignore[attr-defined]
-            found = solve_ivp(rate, (0.0, left), state, "DOP853", events=rest, rtol=1e-9, atol=1e-9)
-            left -= float(found.t[-1])
+            found = solve_ivp(rate, (0.0, remaining), state, "DOP853", events=rest, rtol=1e-9, atol=1e-9)
+            remaining -= float(found.t[-1])
             state = found.y[:, -1].copy()
             if found.status == 1:
                 state[1] = 0.0
@@ -176,7 +176,7 @@ def batches() -> None:
     p, t_s = bench.brake, bench.timing.sample_time
     weights = physical_weights(bench.noise)
     u = np.random.default_rng(0).uniform(-3.0, 3.0, (BATCH, STEPS // 20)).repeat(20, axis=1)
-    chosen, _ = no_sensitivity(PARAMETER_NAMES)
+    unknowns, _ = no_sensitivity(PARAMETER_NAMES)
     run = compiled(learn_batch, parallel=True)
     start = time.perf_counter()
     expected = solve(p, u[0], t_s)
@@ -188,18 +188,18 @@ def batches() -> None:
     for name in PLANTS:
         fastest = np.inf
         for _ in range(REPEATS + 1):
-            x, s = np.zeros((BATCH, STATES)), np.zeros((BATCH, len(chosen), SENSITIVE))
-            m = np.zeros((BATCH, packed_size(len(chosen))))
+            x, s = np.zeros((BATCH, STATES)), np.zeros((BATCH, len(unknowns), SENSITIVE))
+            m = np.zeros((BATCH, packed_size(len(unknowns))))
             start = time.perf_counter()
-            run(bench.plant(name).mechanics, p, u, t_s, chosen, x, s, m, *weights)
+            run(bench.plant(name).mechanics, p, u, t_s, unknowns, x, s, m, *weights)
             fastest = min(fastest, time.perf_counter() - start)
         if name == "exact":
             np.testing.assert_allclose(x[0, :2], expected[-1], rtol=1e-6, atol=1e-6)
         rates[name] = rate = u.size / fastest
         target = f"{TARGETS[name] / 1e6:.0f}" if name in TARGETS else ""
         print(f"{f'{name}, {BATCH} brakes':<36}{rate / 1e6:>8.2f}{target:>8}{peer / 1e6:>23.4f}{rate / peer:>8.0f}")
-    said = ", ".join(f"{name} {rate / 1e6:.2g}" for name, rate in rates.items())
-    print(f"| brake with 4 sensitivities and information, {threads} threads | – | {said} M steps/s |")
+    text = ", ".join(f"{name} {rate / 1e6:.2g}" for name, rate in rates.items())
+    print(f"| brake with 4 sensitivities and information, {threads} threads | – | {text} M steps/s |")
     print(f"| exact brake over scipy's `solve_ivp`, state alone: speed | – | {rates['exact'] / peer:,.0f} |")
 
 

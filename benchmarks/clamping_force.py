@@ -80,17 +80,17 @@ class Outcome(NamedTuple):
     nominal: Sequence[float]  # Errors of the force with nominal parameters, of each step [N]
     estimated: Sequence[float] = ()  # The same with estimated ones
     bounds: Sequence[float] = ()  # Of those [N]
-    held: Sequence[Sequence[bool]] = ()  # True if the total of each quantity held the true one, at each step
+    inside: Sequence[Sequence[bool]] = ()  # True if the total of each quantity held the true one, at each step
 
 
 def drawn(bench: Bench, rng: np.random.Generator) -> Truth:
     """A brake within ±50 %; its errors are from their priors."""
     factors, (inertia, scale, offset) = rng.uniform(0.5, 1.5, 4).tolist(), rng.standard_normal(3).tolist()
-    known, p = bench.systematic, bench.brake
+    priors, p = bench.systematic, bench.brake
     names = ("k_m", "k_1", "T_c", "f_v")
     four = {name: getattr(p, name) * factor for name, factor in zip(names, factors, strict=True)}
-    brake = p._replace(J=p.J * (1.0 + known.inertia * inertia), **four)
-    return Truth(brake, 1.0 + known.angle_scale * scale, known.offset * offset)
+    brake = p._replace(J=p.J * (1.0 + priors.inertia * inertia), **four)
+    return Truth(brake, 1.0 + priors.angle_scale * scale, priors.offset * offset)
 
 
 def seen(truth: Truth, plant: Plant) -> tuple[BrakeParameters, Plant]:
@@ -132,9 +132,9 @@ def steps(told: Believed, brake: Brake, bench: Bench, seed: int) -> list[float]:
         a = way / (RAMP * t_s) ** 2 * 60.0 * r * (1.0 - r) * (1.0 - 2.0 * r)
         force = clamping_force(m, p, max(x, 0.0), 0.0)
         friction = np.sign(way) * sliding_torque(m, p, abs(v), force, decay(m, v) if v else 1.0)
-        wanted = (p.J * a + p.gamma * force + friction) / p.k_m - told.current_offset
-        wanted += STIFFNESS * (x - (angle - told.offset)) + DAMPING * (v - velocity)
-        return float(np.clip(wanted, -bench.limits.current, bench.limits.current))
+        requested = (p.J * a + p.gamma * force + friction) / p.k_m - told.current_offset
+        requested += STIFFNESS * (x - (angle - told.offset)) + DAMPING * (v - velocity)
+        return float(np.clip(requested, -bench.limits.current, bench.limits.current))
 
     periods = RAMP + HOLD
     forces = clamped(brake, bench, current, periods * len(STEPS), np.random.default_rng([seed, 1]))
@@ -156,15 +156,15 @@ def outcome(bench: Bench, plant: Plant, seed: int) -> Outcome:
     errors = e.problem.at(e.z, 0).errors
     told = Believed(e.theta, e.problem.mechanics(e.z), errors.offset or 0.0, errors.current_offset)
     found = [clamping(e, angle_of(told.brake, told.mechanics, force)) for force in STEPS]
-    held = []
+    inside = []
     for one in filter(None, found):
         force = clamping_force(m, p, one.angle / truth.scale, 0.0)
         true = force, p.gamma * force / p.k_m, static_torque(m, p, force) / p.gamma
-        held.append(
+        inside.append(
             [abs(getattr(one, n).value - t) <= getattr(one, n).total for n, t in zip(QUANTITIES, true, strict=True)]
         )
     return Outcome(
-        True, nominal, steps(told, real, bench, seed), [one.force.total for one in filter(None, found)], held
+        True, nominal, steps(told, real, bench, seed), [one.force.total for one in filter(None, found)], inside
     )
 
 
@@ -176,9 +176,9 @@ def report(name: str, outcomes: Sequence[Outcome]) -> None:
     print(f"plant {name}: fits {share(len(fits), len(outcomes))}")
     print(f"  95 % of the errors: nominal {last[0]:.4g} N, estimated {last[1]:.4g} N, ratio {last[1] / last[0]:.3f}")
     print(f"  bound held {share(int((after <= bounds).sum()), after.size)}; median {np.median(bounds):.3g} N")
-    held = np.array([one.held for one in fits])
+    inside = np.array([one.inside for one in fits])
     for i, quantity in enumerate(QUANTITIES):
-        print(f"    total of {quantity} {share(int(held[:, :, i].sum()), held[:, :, i].size)}", flush=True)
+        print(f"    total of {quantity} {share(int(inside[:, :, i].sum()), inside[:, :, i].size)}", flush=True)
 
 
 def main() -> None:

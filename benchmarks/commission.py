@@ -132,7 +132,7 @@ def commissioned(
     number: int,
     folder: Path,
     drive: str,
-    said: Callable[[str], None],
+    say: Callable[[str], None],
     *,
     is_outside: bool = False,
     is_observed: bool = False,
@@ -155,7 +155,7 @@ def commissioned(
     name = drive if plant == "mapped" else plant
     row: dict[str, Any] = {"number": number, "plant": name, "truth": drawn, "outside": outside, "error": ""}
     try:
-        result = Commissioning(folder, sheet, iface, ("--yes",), run, said).run()
+        result = Commissioning(folder, sheet, iface, ("--yes",), run, say).run()
     except EmbError as err:
         row["error"] = str(err)
         result = None
@@ -213,12 +213,12 @@ def main() -> None:
     setattr(simulated_drives, "DRIVES", {name: recorded(kind) for name, kind in simulated_drives.DRIVES.items()})  # noqa: B010
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
-        chosen = [
+        numbers = [
             n
             for n in range(args.first, args.first + args.brakes)
             if args.observer or PLANTS[n % len(PLANTS)] in args.plants
         ]
-        for number in chosen:
+        for number in numbers:
             folder = (args.keep or Path(scratch)) / str(number)
             folder.mkdir(parents=True)
             drive = args.drives[number // len(PLANTS) % len(args.drives)]

@@ -3,7 +3,7 @@
     python benchmarks/cycle.py [--seconds 10] [--actor structured.onnx]
 
 ``emb-run`` as it is, with policy, guard, shield and logging into a real recorder, on a pair of local sockets that carry
-``struct can_frame`` instead of a CAN interface; a simulated brake at the other end, in a process of its own, at 1 kHz.
+``struct can_frame`` instead of a CAN interface; a simulated brake at the other end, in another process, at 1 kHz.
 The times are those in the log. A second run with a stop-watch around each step gives the breakdown, a little longer in
 total; there is none for the compiled core (``EMB_CORE=compiled``, after ``python -m tools.compile_core``), in which no
 function can be replaced. Exit code 0 if the median is at most 60 us and 99.9 % of the cycles take at most 150 us.
@@ -72,7 +72,7 @@ class Run(NamedTuple):
     answered: int
     missed: int
     messages: int  # In the log
-    said: str
+    realtime: str  # Settings that were obtained
 
 
 def main() -> int:
@@ -84,23 +84,23 @@ def main() -> int:
     samples = round(args.seconds * 1000)
     taken = compiled_core.running()
     plain = run_once(samples, args.actor)
-    print(f"core: {taken.text}; {plain.answered} of {samples} samples answered; {plain.said}")
+    print(f"core: {taken.text}; {plain.answered} of {samples} samples answered; {plain.realtime}")
     quantiles = (50.0, 90.0, 99.0, 99.9, 100.0)
     print(f"{'':34}" + "".join(f"{q:9g} %" for q in quantiles))
-    for said, values in (
+    for title, values in (
         ("pair arrived to pair in hand", plain.age),
         ("pair in hand to command sent", plain.work),
         ("pair arrived to command sent", plain.age + plain.work),
     ):
-        print(f"{said:34}" + "".join(f"{1e6 * v:8.1f} us" for v in np.percentile(values, quantiles)))
+        print(f"{title:34}" + "".join(f"{1e6 * v:8.1f} us" for v in np.percentile(values, quantiles)))
     print(
         f"processor time per cycle, waiting excluded: {1e6 * plain.busy:.1f} us, {plain.busy / 1e-3:.1%} of the period"
     )
     if not taken.compiled:
         watched = run_once(samples, args.actor, STEPS)
         print(f"{'step':34}{'median':>11}{'per cycle':>11}")
-        for said, values in watched.steps.items():
-            print(f"{said:34}{1e6 * np.median(values):8.1f} us{len(values) / watched.answered:11.2f}")
+        for title, values in watched.steps.items():
+            print(f"{title:34}{1e6 * np.median(values):8.1f} us{len(values) / watched.answered:11.2f}")
     met = True
     for quantile, limit in LIMITS.items():
         got = float(np.percentile(plain.work, quantile))
@@ -140,15 +140,15 @@ def run_once(
 
         stack.enter_context(mock.patch.object(experiment, "open_transport", open_it))
         stack.enter_context(mock.patch.object(session, "Loop", lambda **given: _Counted(loop.Loop(**given), busy)))
-        for said, (owner, name) in (watched or {}).items():
-            stack.enter_context(_stopwatch(owner, name, steps[said]))
+        for title, (owner, name) in (watched or {}).items():
+            stack.enter_context(_stopwatch(owner, name, steps[title]))
         log = folder / "run.mcap"
         arguments = ["--iface", "pair", "--bench", str(bench), "--policy", str(actor), "--log", str(log)]
         with contextlib.redirect_stdout(io.StringIO()) as out:
             code = run.main([*arguments, "--json", "--yes", "--no-watchdog", "--long-timeouts", *options])
-        said = json.loads(out.getvalue().splitlines()[-1])
+        document = json.loads(out.getvalue().splitlines()[-1])
         if not log.exists():
-            raise SystemExit(f"emb-run ended with {code}: {said}")
+            raise SystemExit(f"emb-run ended with {code}: {document}")
         found = timing(read_log(log))
     return Run(
         work=found.decision + found.sending,
@@ -156,9 +156,9 @@ def run_once(
         busy=busy[0] / len(found.response),
         steps={name: 1e-9 * np.array(values) for name, values in steps.items()},
         answered=len(found.response),
-        missed=said["missed"],
-        messages=said["log_messages"],
-        said=", ".join(f"{k} {v}" for k, v in said.get("realtime", {}).items()),
+        missed=document["missed"],
+        messages=document["log_messages"],
+        realtime=", ".join(f"{k} {v}" for k, v in document.get("realtime", {}).items()),
     )
 
 

@@ -132,9 +132,9 @@ def searched(bench: Bench, brake: BrakeParameters, model: str, name: str, number
     return Line(model, name, number, seed, long, phi, wall, cpu)
 
 
-def share(line: Line, known: dict[str, dict[str, Any]]) -> float:
+def share(line: Line, best_known: dict[str, dict[str, Any]]) -> float:
     """Share of the best known, of det M^(1/4), λ_min, or the information."""
-    return math.exp((line.phi - known[line.key]["phi"]) / (4.0 if line.criterion == "D" else 1.0))
+    return math.exp((line.phi - best_known[line.key]["phi"]) / (4.0 if line.criterion == "D" else 1.0))
 
 
 def main() -> None:
@@ -148,37 +148,37 @@ def main() -> None:
     options.add_argument("--long", action="store_true", help="search longer and otherwise")
     options.add_argument("--keep", action="store_true", help="store what is better than the best known")
     options.add_argument("--results", type=Path, help="file of results, one a line: those in it are not searched again")
-    chosen = options.parse_args()
+    args = options.parse_args()
     bench = load_bench()
-    known = json.loads(KNOWN.read_text(encoding="utf-8")) if KNOWN.exists() else {}
+    best_known = json.loads(KNOWN.read_text(encoding="utf-8")) if KNOWN.exists() else {}
     lines: list[Line] = []
-    if chosen.results is not None and chosen.results.exists():
-        lines = [Line(**json.loads(text)) for text in chosen.results.read_text(encoding="utf-8").splitlines()]
-    print(f"brakes drawn with seed {DRAWN}, search with seed {chosen.seed}")
+    if args.results is not None and args.results.exists():
+        lines = [Line(**json.loads(text)) for text in args.results.read_text(encoding="utf-8").splitlines()]
+    print(f"brakes drawn with seed {DRAWN}, search with seed {args.seed}")
     print(f"{'brake':7}{'of':5}{'number':>6}{'value':>13}{'share':>9}{'wall s':>8}{'cpu s':>7}")
     shown = []
-    for number, brake in list(enumerate(points(bench, chosen.first + chosen.points)))[chosen.first :]:
-        for model, name in itertools.product(chosen.models, chosen.criteria):
-            wanted = (model, name, number, chosen.seed, chosen.long)
-            line = next((before for before in lines if before[:5] == wanted), None)
+    for number, brake in list(enumerate(points(bench, args.first + args.points)))[args.first :]:
+        for model, name in itertools.product(args.models, args.criteria):
+            key = (model, name, number, args.seed, args.long)
+            line = next((before for before in lines if before[:5] == key), None)
             if line is None:
-                line = searched(bench, brake, *wanted)
-                if chosen.results is not None:
-                    with chosen.results.open("a", encoding="utf-8") as file:
+                line = searched(bench, brake, *key)
+                if args.results is not None:
+                    with args.results.open("a", encoding="utf-8") as file:
                         file.write(json.dumps(line._asdict()) + "\n")
-            note = "" if line.key in known else "  the first that is known"
-            if line.key not in known or line.phi > known[line.key]["phi"]:
-                known[line.key] = {"phi": line.phi, "how": line.how, "brake": brake._asdict()}
-                if chosen.keep:
-                    KNOWN.write_text(json.dumps(known, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+            note = "" if line.key in best_known else "  the first that is known"
+            if line.key not in best_known or line.phi > best_known[line.key]["phi"]:
+                best_known[line.key] = {"phi": line.phi, "how": line.how, "brake": brake._asdict()}
+                if args.keep:
+                    KNOWN.write_text(json.dumps(best_known, indent=1, sort_keys=True) + "\n", encoding="utf-8")
             shown.append(line)
-            value, part = line.phi if name == "D" else math.exp(line.phi), share(line, known)
+            value, part = line.phi if name == "D" else math.exp(line.phi), share(line, best_known)
             print(
                 f"{model:7}{name:5}{number:6}{value:13.7g}{part:9.4f}{line.wall:8.1f}{line.cpu:7.1f}{note}", flush=True
             )
-    for model, name in itertools.product(chosen.models, chosen.criteria):
+    for model, name in itertools.product(args.models, args.criteria):
         of = [line for line in shown if (line.model, line.criterion) == (model, name)]
-        shares, cpu = [share(line, known) for line in of], [line.cpu for line in of]
+        shares, cpu = [share(line, best_known) for line in of], [line.cpu for line in of]
         low = sum(part < LIMITS[name] for part in shares)
         print(
             f"{model:7}{name:5}{len(of)} of them: share median {statistics.median(shares):.4f}, least {min(shares):.4f}"

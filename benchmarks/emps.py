@@ -100,10 +100,10 @@ def main() -> None:
         others = None if arguments.other is None else _opened(arguments.other, Path(folder))
     bench = opened.bench
     plant = bench.plant("recorded")
-    whole = opened.experiment.seen_by(plant)
+    experiment = opened.experiment.seen_by(plant)
     other = None if others is None else others.experiment.seen_by(plant)
     begun = time.process_time()
-    e = method_of("windows")(bench, plant, ASKED, starts=2).fit([whole])
+    e = method_of("windows")(bench, plant, ASKED, starts=2).fit([experiment])
     fits = "fits" if e.validation.fits else "DOES NOT FIT"
     print(f"the model {fits}; {time.process_time() - begun:.1f} s of the processor")
     print("".join(f"  - {caveat}\n" for caveat in caveats(e)), end="")
@@ -111,25 +111,25 @@ def main() -> None:
         covers = "covers" if abs(value - PUBLISHED[name]) <= half else "does NOT cover"
         print(f"  {name:7} {value:9.3f} ± {half:6.3f}, {covers} the published {PUBLISHED[name]:.3f}")
     if other is None:
-        middle = len(whole.currents) // 2
-        first, held = _part(whole, 0, middle), _part(whole, middle, len(whole.currents))
+        middle = len(experiment.currents) // 2
+        first, held_out = _part(experiment, 0, middle), _part(experiment, middle, len(experiment.currents))
         print("held back: the second half, predicted in windows of 0.5 s from the first")
     else:
-        first, held = whole, other
+        first, held_out = experiment, other
         print("held back: the other recording, predicted in windows of 0.5 s from the first")
     position = np.concatenate([[first.angle], first.samples[:, 0]])
     scipy = least_squares(position, np.append(first.currents, first.currents[-1]))
-    own, directed = (method_of("windows")(bench, plant, asked, starts=2).fit([first]) for asked in (ASKED, DIRECTED))
+    plain, directed = (method_of("windows")(bench, plant, asked, starts=2).fit([first]) for asked in (ASKED, DIRECTED))
     mass, *by_direction = PUBLISHED_BY_DIRECTION.values()
     (viscous, share), (coulomb, offset) = _halves(*by_direction[:2]), _halves(*by_direction[2:])
     for name, asked, values in (
-        ("ours", ASKED, own.values),
+        ("ours", ASKED, plain.values),
         ("ours, by direction", DIRECTED, directed.values),
         ("scipy alone", ASKED, _ours(*scipy.tolist())),
         ("published", ASKED, _ours(*PUBLISHED.values())),
         ("published, by direction", DIRECTED, np.append(_ours(mass, viscous, coulomb, offset), share / viscous)),
     ):
-        problem = make_problem(bench, plant, [held], replace(asked, window=0.5))
+        problem = make_problem(bench, plant, [held_out], replace(asked, window=0.5))
         print(f"  {name:23} root mean square {1e6 * predict_windows(problem, values)[0]:.1f} um")
 
 

@@ -182,9 +182,9 @@ def _follow(b, x, z, w, moved):  # type: ignore[no-untyped-def]
 @numba.njit(cache=False)
 def _friction(b, x, v, force, sign):  # type: ignore[no-untyped-def]
     """Friction but the viscous one: Coulomb's, and what is static beyond it as far as it is left at a speed."""
-    left = math.exp(-((v / b[_VS]) ** 2))
+    remaining = math.exp(-((v / b[_VS]) ** 2))
     coulomb = b[_TC] * (1.0 + b[_ASYM] * sign) * (1.0 + 0.01 * b[_PLACE] * x) * _formed(b, 3, x, v, 0.0)
-    return coulomb * (1.0 + b[_STRIBECK] * left) + (b[_FL] * left + b[_MU]) * force
+    return coulomb * (1.0 + b[_STRIBECK] * remaining) + (b[_FL] * remaining + b[_MU]) * force
 
 
 @numba.njit(cache=False)
@@ -236,18 +236,18 @@ def _runge_kutta(b, x, v, i, u, z, w, sign, h):  # type: ignore[no-untyped-def]
 def _move(b, state, command, duration):  # type: ignore[no-untyped-def]
     """Angle, velocity, current, clearance and hysteresis after a time with one command."""
     x, v, i, z, w = state
-    u, left = command + b[_BIAS], duration
+    u, remaining = command + b[_BIAS], duration
     if b[_LAG] == 0.0:
         i = u
-    while left > 1e-15:
-        h = min(STEP, left)
+    while remaining > 1e-15:
+        h = min(STEP, remaining)
         if v == 0.0:
             force = _force(b, x, z, w)
             drive = _drive(b, x, 0.0, _current(b, i, u, h)) - b[_GAMMA] * force
             sign = 1.0 if drive > 0.0 else -1.0
             if abs(drive) <= _friction(b, x, 0.0, force, sign):
                 i = _current(b, i, u, h)
-                left -= h
+                remaining -= h
                 continue
         else:
             sign = 1.0 if v > 0.0 else -1.0
@@ -267,7 +267,7 @@ def _move(b, state, command, duration):  # type: ignore[no-untyped-def]
         z, w = _follow(b, x_end, z, w, x_end - x)
         i = _current(b, i, u, h)
         x, v = x_end, v_end
-        left -= h
+        remaining -= h
     return x, v, i, z, w
 
 
@@ -296,8 +296,8 @@ class _Sensors:
 
     def shown(self, x: float, v: float) -> Floats:
         b = self.brake
-        left = math.exp(-self.t_s / b.velocity_lag) if b.velocity_lag > 0.0 else 0.0
-        self.lagged = v + (self.lagged - v) * left
+        remaining = math.exp(-self.t_s / b.velocity_lag) if b.velocity_lag > 0.0 else 0.0
+        self.lagged = v + (self.lagged - v) * remaining
         angle = x * (1.0 + b.angle_scale) + b.encoder_offset + b.eccentricity * math.sin(x)
         gain = 1.0 + b.velocity_gain + (b.velocity_asymmetry if v > 0.0 else 0.0)
         true = np.array([angle, self.lagged * gain])
@@ -344,23 +344,23 @@ def simulate(
     """
     n, t_s, b = bench.timing.horizon, bench.timing.sample_time * (1.0 + brake.clock_scale), brake.numbers()
     constant = b[_KM : _FV + 1].copy()
-    wanted = excitation(rng, n, bench.limits.current)
+    requested = excitation(rng, n, bench.limits.current)
     state, before = (0.0, 0.0, brake.current_offset, 0.0, 0.0), 0.0
     currents, acted, samples = np.empty(n), np.empty(n), np.empty((n, 2))
     sensors = _Sensors(brake, bench, rng)
     rest = np.mean([sensors.shown(0.0, 0.0) for _ in range(AT_REST)], axis=0)
     angle, velocity = rest
-    heard, assumed = True, np.full(n, np.nan)
+    received, assumed = True, np.full(n, np.nan)
     lowest, highest = bench.limits.angle
     for k in range(n):
-        u = wanted[k]
+        u = requested[k]
         ahead = angle + 0.04 * velocity
         if ahead > highest - 25.0 or velocity > bench.limits.velocity - 120.0:
             u = -bench.limits.current * 0.7
         elif ahead < lowest + 6.0 or velocity < -(bench.limits.velocity - 120.0):
             u = bench.limits.current * 0.7
-        said = round(float(u), 3) if heard else braking(bench, float(velocity))
-        u = said if heard and not (losses and losses.commands[k]) else braking(bench, state[1])
+        commanded = round(float(u), 3) if received else braking(bench, float(velocity))
+        u = commanded if received and not (losses and losses.commands[k]) else braking(bench, state[1])
         b[_KM : _FV + 1] = constant * (1.0 + b[_KM_DRIFT : _FV_DRIFT + 1] * (k + 0.5) / n)
         b[_NOW] = (k + 0.5) / n
         settling = math.exp(-k * t_s / SETTLING)
@@ -378,11 +378,11 @@ def simulate(
             seen = _move(b, begun, u, (1.0 - brake.delay) * t_s + late) if late != 0.0 else state
         currents[k] = acted[k] = before = u
         shown = sensors.shown(seen[0], seen[1])
-        heard = losses is None or not losses.samples[k]
-        if heard:
+        received = losses is None or not losses.samples[k]
+        if received:
             samples[k] = angle, velocity = shown
         else:
-            samples[k], currents[k], assumed[k] = np.nan, said, said
+            samples[k], currents[k], assumed[k] = np.nan, commanded, commanded
     slack = bench.noise.angle / math.sqrt(AT_REST)
     at_origin = abs(rest[0]) <= ORIGIN_SIGMAS * slack
     if charge and losses is not None:
@@ -390,8 +390,8 @@ def simulate(
         alone = losses.samples & ~lost[:-2] & ~lost[2:]
         alone[-1] = False  # after it nothing was received
         currents, assumed = np.where(alone, acted, currents), np.where(alone, np.nan, assumed)
-    known = None if losses is None or not losses.samples.any() else assumed
-    return Experiment(name, currents, samples, float(rest[0]), 0.0, slack, bool(at_origin), assumed=known)
+    unreported = None if losses is None or not losses.samples.any() else assumed
+    return Experiment(name, currents, samples, float(rest[0]), 0.0, slack, bool(at_origin), assumed=unreported)
 
 
 def motion(brake: Brake, currents: Floats, t_s: float) -> Floats:

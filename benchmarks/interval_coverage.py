@@ -9,7 +9,7 @@ no code with the estimators. The cases are ``CASES``:
 - ``total``: a right model, all systematic errors drawn from their priors in the bench file;
 - ``inertia``, ``angle_scale``: only that one drawn;
 - ``unlisted``: a small error of the model of one of ``UNLISTED``;
-- ``drawn``: a small error of the model whose form is drawn: 20 kinds that nobody has chosen (:func:`kind_of`);
+- ``drawn``: a small error of the model whose form is drawn: 20 kinds (:func:`kind_of`);
 - ``prior``: errors and effects drawn from all priors;
 - ``known``: a right model whose k_m was measured to 0.1 %, its inertia drawn with 5 %, the scale of the angle with its
   prior or right and excluded;
@@ -21,8 +21,8 @@ no code with the estimators. The cases are ``CASES``:
 
 Where J and the scale of the angle are right in all records, the bench file says so (``inertia = angle_scale = 0``), for
 their priors are wide beside everything else; ``repeatability`` does so with the clock as well. A row has the records
-that are said to fit, the parameters inside their 95 % intervals by total and by repeatability, the records that are
-said to fit with a parameter beyond 3 total deviations, and the share of noticed errors whose cause is named first.
+that fit by their test, the parameters inside their 95 % intervals by total and by repeatability, the records that
+fit by it with a parameter beyond 3 total deviations, and the share of noticed errors whose cause is named first.
 Shares have 95 % intervals (Clopper and Pearson 1934); parameters of one record are not independent, and count as if
 they were.
 """
@@ -57,7 +57,7 @@ from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.numbers import in_percent
 
-FAR = 3.0  # Stated deviations; a value further off that is said to be usable is wrong
+FAR = 3.0  # Stated deviations; a usable value that is further off is wrong
 BURST = 20  # Samples in a burst of losses
 COMMANDS = 0.2  # Commands that are lost, for each sample that is
 
@@ -180,17 +180,17 @@ def near_misses(bench: Bench, draws: int, seed: int) -> Iterator[Drawn]:
     """Wrong models and right ones in turns."""
     plant = bench.plant("exact")
     for name, kind in KINDS.items():
-        held = kind.error if kind.error in PARAMETER_NAMES else None  # estimated by nobody
+        fixed = kind.error if kind.error in PARAMETER_NAMES else None  # estimated by nobody
         for size in kind.sizes:
             for _ in range(draws):
                 rng = np.random.default_rng(seed)
                 factors = rng.uniform(0.5, 1.5, 4)
-                if held:
-                    factors[PARAMETER_NAMES.index(held)] = 1.0 + size
+                if fixed:
+                    factors[PARAMETER_NAMES.index(fixed)] = 1.0 + size
                 brake = brake_of(bench, plant, factors)
-                wrong = brake if held else Brake(**(vars(brake) | {kind.error: size}))
+                wrong = brake if fixed else Brake(**(vars(brake) | {kind.error: size}))
                 record = simulate(wrong, bench, rng, f"seed {seed}")
-                params = tuple(p for p in PARAMETER_NAMES if p != held)
+                params = tuple(p for p in PARAMETER_NAMES if p != fixed)
                 yield Drawn(f"{name}, {size:.2g} {kind.unit}", bench, plant, record, wrong, params, kind.causes)
                 rng = np.random.default_rng(seed + 1)
                 right = brake_of(bench, plant, rng.uniform(0.5, 1.5, 4))
@@ -287,7 +287,7 @@ ALWAYS_POSITIVE = {"delay", "hysteresis", "play", "f_l", "current_lag", "dead_cu
 
 def prior(bench: Bench, draws: int, seed: int) -> Iterator[Drawn]:
     """Brakes as we expect them: each error and effect is there in one of six, at any of the sizes of its prior."""
-    plant, known = bench.plant("exact"), bench.systematic
+    plant, priors = bench.plant("exact"), bench.systematic
     same = ("quadratic", "cubic", "hysteresis", "play", "f_l", "current_lag", "ripple", "stiffness_ripple", "drag")
     fields = {name: name for name in (*same, "current_gain", "dead_current")}
     fields |= {name: ERRORS[name] for name in ("offset", "current_offset", "delay", "velocity_gain")}
@@ -299,14 +299,14 @@ def prior(bench: Bench, draws: int, seed: int) -> Iterator[Drawn]:
             drawn = float(deviation * rng.choice(SHARES) * rng.standard_normal() * (rng.random() < EXPECTED))
             return abs(drawn) if name in ALWAYS_POSITIVE else drawn
 
-        drawn = {field: size(name, getattr(known, name)) for name, field in fields.items()}
-        drawn |= {f"{name.lower()}_drift": size("drift", known.drift) for name in PARAMETER_NAMES}
+        drawn = {field: size(name, getattr(priors, name)) for name, field in fields.items()}
+        drawn |= {f"{name.lower()}_drift": size("drift", priors.drift) for name in PARAMETER_NAMES}
         friction, speed = [("break_away", 30.0), ("slow_friction", 100.0), ("slow_friction", 200.0)][rng.integers(3)]
-        drawn |= {"stribeck": size(friction, getattr(known, friction)), "stribeck_velocity": speed}
+        drawn |= {"stribeck": size(friction, getattr(priors, friction)), "stribeck_velocity": speed}
         drawn["delay"] = min(drawn["delay"], LATEST)
-        drawn["inertia"] = brake.inertia * (1.0 + known.inertia * rng.standard_normal())
-        drawn["angle_scale"] = known.angle_scale * rng.standard_normal()
-        drawn["clock_scale"] = known.time_scale * rng.standard_normal()
+        drawn["inertia"] = brake.inertia * (1.0 + priors.inertia * rng.standard_normal())
+        drawn["angle_scale"] = priors.angle_scale * rng.standard_normal()
+        drawn["clock_scale"] = priors.time_scale * rng.standard_normal()
         brake = Brake(**(vars(brake) | drawn))
         yield Drawn("prior", bench, plant, simulate(brake, bench, rng, f"seed {at}"), brake)
 
@@ -510,9 +510,9 @@ def main() -> None:
         bench = replace(bench, systematic=replace(bench.systematic, time_scale=0.0))
     for drawn in CASES[args.case](bench, args.draws, args.seed):
         outcomes.setdefault(drawn.row, []).append(judge(drawn, args.method, systematic=args.systematic == "bench"))
-    for row, own in outcomes.items():
-        report(row, own)
-    every = [o for own in outcomes.values() for o in own]
+    for row, found in outcomes.items():
+        report(row, found)
+    every = [o for found in outcomes.values() for o in found]
     wrong = [o for o in every if o.drawn.causes]
     if wrong:
         report("all that are wrong", wrong)

@@ -112,10 +112,10 @@ def _messages(port: int) -> int:
     """Messages that a viewer of the Foxglove WebSocket protocol gets until the server ends."""
     count = 0
     with _connected(port, "foxglove.sdk.v1") as viewer:
-        for said in viewer:
-            if isinstance(said, bytes):
-                count += said[0] == 1
-            elif (document := json.loads(said)).get("op") == "advertise":
+        for text in viewer:
+            if isinstance(text, bytes):
+                count += text[0] == 1
+            elif (document := json.loads(text)).get("op") == "advertise":
                 new = [{"id": channel["id"], "channelId": channel["id"]} for channel in document["channels"]]
                 viewer.send(json.dumps({"op": "subscribe", "subscriptions": new}))
     return count
@@ -124,7 +124,7 @@ def _messages(port: int) -> int:
 def _samples(port: int) -> int:
     """Samples that the page of a browser gets until the server ends."""
     with _connected(port, SUBPROTOCOL) as page:
-        return sum(len(json.loads(said).get("cycles", ())) for said in page)
+        return sum(len(json.loads(text).get("cycles", ())) for text in page)
 
 
 if __name__ == "__main__":

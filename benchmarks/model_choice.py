@@ -45,7 +45,7 @@ class Outcome(NamedTuple):
     first: str
     right: bool  # True if the right plant comes first
     predicts: bool  # True if it has the best held-out score
-    fits: bool  # True if it is said to fit
+    fits: bool  # True if its residuals pass the tests
     not_excluded: bool  # True if it is among those that the record does not tell apart
     covered: float  # Share of the parameters that the intervals of the mixture cover
     alone: float  # Share that the intervals of the first plant alone cover
@@ -69,18 +69,18 @@ def with_errors(bench: Bench, plant: Plant, brake: Brake, size: float, rng: np.r
 
 def fitted(bench: Bench, plant: str, record: Experiment, truth: dict[str, float], seed: int) -> Outcome:
     """All plants fitted."""
-    asked = with_systematic(EstimationProblem(), bench, bench.plant(DEFAULT_PLANT))
-    right = model_of(bench.plant(plant), asked)
-    alike = [name for name, other in bench.plants.items() if model_of(other, asked) == right]
+    problem = with_systematic(EstimationProblem(), bench, bench.plant(DEFAULT_PLANT))
+    right = model_of(bench.plant(plant), problem)
+    alike = [name for name, other in bench.plants.items() if model_of(other, problem) == right]
     begun = time.perf_counter()
     found = choose_model(
-        bench, list(bench.plants.values()), lambda p: [started(record, p)], asked, starts=STARTS, seed=seed
+        bench, list(bench.plants.values()), lambda p: [started(record, p)], problem, starts=STARTS, seed=seed
     )
     seconds = time.perf_counter() - begun
     e = found.best.estimate
     pairs = [
-        (found.interval(u), own, truth[u.name])
-        for u, own in zip(e.unknowns, e.intervals().tolist(), strict=True)
+        (found.interval(u), interval, truth[u.name])
+        for u, interval in zip(e.unknowns, e.intervals().tolist(), strict=True)
         if u.name in truth
     ]
     return Outcome(
@@ -121,7 +121,7 @@ def main() -> None:
     print(f"seeds {args.seed} to {args.seed + args.draws * len(bench.plants) - 1}")
     print(f"{'plant':12}{'first':>7}{'held-out':>10}{'fits':>6}{'kept':>6}{'seconds':>9}  taken for")
     for name, plant in bench.plants.items():
-        own = []
+        found = []
         for _ in range(args.draws):
             rng = np.random.default_rng(seed)
             brake = brake_of(bench, plant, rng.uniform(0.5, 1.5, 4))
@@ -129,13 +129,13 @@ def main() -> None:
                 brake = with_errors(bench, plant, brake, args.errors, rng)
             record = simulate(brake, bench, rng, f"seed {seed}")
             truth = {"k_m": brake.k_m, "k_1": brake.k_1, "T_c": brake.t_c, "f_v": brake.f_v}
-            own.append(compared(bench, name, record) if args.nominal else fitted(bench, name, record, truth, seed))
+            found.append(compared(bench, name, record) if args.nominal else fitted(bench, name, record, truth, seed))
             seed += 1
-        outcomes += own
-        wrong, seconds = Counter(o.first for o in own if not o.right), np.median([o.seconds for o in own])
+        outcomes += found
+        wrong, seconds = Counter(o.first for o in found if not o.right), np.median([o.seconds for o in found])
         print(
-            f"{name:12}{sum(o.right for o in own):7}{sum(o.predicts for o in own):10}"
-            f"{sum(o.fits for o in own):6}{sum(o.not_excluded for o in own):6}{seconds:9.2f}  "
+            f"{name:12}{sum(o.right for o in found):7}{sum(o.predicts for o in found):10}"
+            f"{sum(o.fits for o in found):6}{sum(o.not_excluded for o in found):6}{seconds:9.2f}  "
             + ", ".join(f"{other} {count}" for other, count in wrong.most_common()),
             flush=True,
         )

@@ -90,9 +90,9 @@ def simulated(theta: Floats, inertia: float, gamma: float, currents: Floats, t_s
     k_m, k_1, t_c, f_v = theta
     x, v, out = 0.0, 0.0, np.empty((len(currents), 2))
     for k, current in enumerate(currents):
-        left = t_s
-        while left > 1e-12:
-            h = min(left, t_s / SUBSTEPS)
+        remaining = t_s
+        while remaining > 1e-12:
+            h = min(remaining, t_s / SUBSTEPS)
             pull = (k_m * current - gamma * k_1 * max(x, 0.0)) / inertia
             if v == 0.0 and abs(pull) <= t_c / inertia:
                 break
@@ -105,7 +105,7 @@ def simulated(theta: Floats, inertia: float, gamma: float, currents: Floats, t_s
                 x, v = x + 0.5 * h * v, 0.0
             else:
                 x, v = x + h * middle, v + h * a
-            left -= h
+            remaining -= h
         out[k] = x, v
     return out
 

@@ -123,8 +123,8 @@ def told(bench: Bench, plant: str, draws: Sequence[Draw], outcome: Outcome, pool
     while (high - low > 1).any():
         middle = (low + high) // 2
         largest = [one.repeatability[: one.count].max() for one in of_first(middle)]
-        known = np.array(largest) <= PRECISION.repeatability
-        low, high = np.where(known, low, middle), np.where(known, middle, high)
+        reached = np.array(largest) <= PRECISION.repeatability
+        low, high = np.where(reached, low, middle), np.where(reached, middle, high)
     measures = {
         "T [nat]": finite([one.of_comparison for one in found]),
         "I [nat]": finite([one.of_repeatability for one in found]),

@@ -90,13 +90,13 @@ def long_logs(folder: Path, minutes: float) -> bool:
         found.append({})
         for command in ("info", "fim"):
             taken, memory, output = measured([command, str(path), "--json"])
-            said = json.loads(output)
-            assert said["complete"], said
+            document = json.loads(output)
+            assert document["complete"], document
             if command == "info":
-                messages = sum(said["messages"].values())
+                messages = sum(document["messages"].values())
             else:
-                assert said["samples"]["measured"] == samples, said["samples"]
-                assert said["fit_sigmas"]["fits"], said["fit_sigmas"]
+                assert document["samples"]["measured"] == samples, document["samples"]
+                assert document["fit_sigmas"]["fits"], document["fit_sigmas"]
             found[-1][command] = taken, memory
             print(f"{length:6g} min{messages:12}{size:8.0f}{command:>9}{taken:10.1f}{memory:12.0f}")
         path.unlink()
@@ -150,12 +150,12 @@ def calls(path: Path) -> bool:
         called = time.perf_counter()
         api.fisher_information(just_opened)
         times.append((calculated - begin, called - calculated, time.perf_counter() - called))
-    core, whole, first = 1e3 * np.min(times, axis=0)
+    core, call, first = 1e3 * np.min(times, axis=0)
     print(
         f"| `api.fisher_information` of an opened log of 0.5 s, beside the calculation in it; over it; the first call "
-        f"beside it | {BESIDE:g} ms; –; – | {whole - core:.2f} ms; {whole / core:.2f}; {first - core:.1f} ms |"
+        f"beside it | {BESIDE:g} ms; –; – | {call - core:.2f} ms; {call / core:.2f}; {first - core:.1f} ms |"
     )
-    return bool(whole - core <= BESIDE)
+    return bool(call - core <= BESIDE)
 
 
 COMMANDS = """

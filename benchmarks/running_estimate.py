@@ -86,10 +86,10 @@ def main() -> None:
         print("|---" * 8 + "|", flush=True)
         for name, declared, true in CASES:
             truths, r = results(bench, quick, declared, true, arguments.brakes, arguments.seed)
-            errors, known = np.abs(r[:, :COUNT] - truths), r[:, COUNT : 2 * COUNT]
-            inside, worst = errors <= NORMAL_95 * known, r[:, WORST]
+            errors, sigmas = np.abs(r[:, :COUNT] - truths), r[:, COUNT : 2 * COUNT]
+            inside, worst = errors <= NORMAL_95 * sigmas, r[:, WORST]
             told = ", ".join(f"{100 * one:.1f}" for one in inside.mean(axis=0))
-            medians = ", ".join(f"{one:.2e}" for one in np.median(known, axis=0))
+            medians = ", ".join(f"{one:.2e}" for one in np.median(sigmas, axis=0))
             print(
                 f"| {name} | {int(r[:, LEFT].sum())} | {share(int(r[:, FITS].sum()), len(r))} | "
                 f"{share(int(inside.sum()), inside.size)} | {told} % | {np.quantile(worst, 1.0 - 1e-4):.2f} | "

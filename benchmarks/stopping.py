@@ -1,7 +1,7 @@
 """Reliability of ``emb-run --stop-when``: what an actor states when it stops, against the brake's truth.
 
 `python benchmarks/stopping.py [--brakes N]` lets the shipped actor, whose model is the exact brake, drive N random
-brakes of ±50 %, exact and forward-Euler ones, as `emb-run --iface sim` does it, until k_1 is known to 1 % and f_v to
+brakes of ±50 %, exact and forward-Euler ones, as `emb-run --iface sim` does it, until k_1 is precise to 1 % and f_v to
 5 %. For each kind it prints how often the run ended early, after how long, how far the
 estimates were from the truth in the stated deviations (root mean square; the share beyond two of them, which is 4.6 %
 if they are right), and the worst error of the runs that ended early.
@@ -50,12 +50,12 @@ def main() -> None:
 def played(brake: np.ndarray, seed: int, plant: str, folder: Path, *arguments: str) -> dict[str, Any]:
     """Summary of one run of `emb-run --iface sim`, with the relative errors of its estimates as `errors`."""
     listed = ",".join(f"{name}={value!r}" for name, value in zip(PARAMETER_NAMES, brake.tolist(), strict=True))
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(io.StringIO()):
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(io.StringIO()):
         code = emb_run(
             ["--iface", f"sim:plant={plant},seed={seed},{listed}", *arguments, "--log", str(folder), "--json"]
         )
-    summary: dict[str, Any] = json.loads(said.getvalue())
+    summary: dict[str, Any] = json.loads(printed.getvalue())
     if code:
         raise SystemExit(f"{plant}, brake {seed}: {summary['result']}")
     found = [summary["estimate"][name]["value"] for name in PARAMETER_NAMES]
@@ -66,7 +66,7 @@ def goals(brakes: np.ndarray, folder: Path) -> None:
     """The shipped actor on brakes of two kinds, until the parameters of GOAL are known."""
     count, rows = len(brakes), []
     goal = ",".join(f"{name}={share:.0%}" for name, share in GOAL.items())
-    asked = [PARAMETER_NAMES.index(name) for name in GOAL]
+    places = [PARAMETER_NAMES.index(name) for name in GOAL]
     print(f"--stop-when {goal}, {count} brakes each")
     print(f"{'brake':8}{'early':>8}{'mean s':>8}{'rms z':>8}{'beyond 2':>10}{'worst k_1, f_v if early':>26}")
     for plant in PLANTS:
@@ -78,7 +78,7 @@ def goals(brakes: np.ndarray, folder: Path) -> None:
             seconds.append(run["duration_s"])
             if run["goal_reached"]:
                 early += 1
-                worst = np.maximum(worst, np.abs(run["errors"])[asked])
+                worst = np.maximum(worst, np.abs(run["errors"])[places])
         beyond = float((np.abs(z) > 2.0).mean())
         told = ", ".join(f"{share:.2%}" for share in worst) if early else "-"
         rows.append(f"{plant}: {early}, {told}")
@@ -99,11 +99,11 @@ def quick(brakes: np.ndarray, folder: Path) -> None:
             at = round(run["goal_s"] / load_bench().timing.sample_time)
             then.append(by_step(read_log(run["log"]))[at][: len(PARAMETER_NAMES)] / brake - 1.0)
         Path(run["log"]).unlink()
-    known = np.array([run["goal_s"] for run in runs if run["goal_reached"]])
-    whole = np.array([run["duration_s"] for run in runs])
+    enough = np.array([run["goal_s"] for run in runs if run["goal_reached"]])
+    durations = np.array([run["duration_s"] for run in runs])
     home = sum(run["home"] for run in runs)
-    print(f"emb-run --quick, {len(runs)} brakes: {len(known)} ended early, {home} home")
-    for what, seconds in (("enough known", known), ("home", whole)):
+    print(f"emb-run --quick, {len(runs)} brakes: {len(enough)} ended early, {home} home")
+    for what, seconds in (("enough known", enough), ("home", durations)):
         print(f"{what:22} mean {seconds.mean():.3f} s, 95 % within {np.quantile(seconds, 0.95):.3f} s, all within "
               f"{seconds.max():.3f} s")  # fmt: skip
     for when, errors in (("then", np.abs(then)), ("at the end", np.abs([run["errors"] for run in runs]))):
@@ -113,7 +113,7 @@ def quick(brakes: np.ndarray, folder: Path) -> None:
     what = f"`--quick`, {len(runs)} brakes ±50 % that stick"
     print(
         f"| {what}: time until the repeatability of all four is 1.2 %, mean and 95 % of the brakes | 0.10 s, 0.13 s | "
-        f"{known.mean():.3f} s, {np.quantile(known, 0.95):.3f} s |"
+        f"{enough.mean():.3f} s, {np.quantile(enough, 0.95):.3f} s |"
     )
     shares = ", ".join(f"{100 * value:.2f}" for value in np.quantile(np.abs(then), 0.95, axis=0))
     print(f"| {what}: true errors of {', '.join(PARAMETER_NAMES)} then, 95 % of the brakes | 1.2 % | {shares} % |")

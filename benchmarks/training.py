@@ -82,8 +82,8 @@ class Batched(VecEnv):
 def stable_baselines(training: Training, bench: Bench, seconds: float) -> float:
     """Steps per second of processor time of Stable-Baselines3's PPO."""
     ppo, actor = training.ppo, training.untrained_actor(bench)
-    (own,) = training.environments(bench, ppo.envs)
-    env = Batched(own, lambda seen: actor.features(torch.from_numpy(seen)).numpy())
+    (envs,) = training.environments(bench, ppo.envs)
+    env = Batched(envs, lambda seen: actor.features(torch.from_numpy(seen)).numpy())
     model = PPO(
         "MlpPolicy",
         env,
@@ -102,7 +102,7 @@ def stable_baselines(training: Training, bench: Bench, seconds: float) -> float:
         device="cpu",
     )
     start = time.process_time()
-    model.learn(ppo.batch)  # whole iterations, as ours: a rollout and what is learned from it
+    model.learn(ppo.batch)  # an iteration, as ours: a rollout and what is learned from it
     while time.process_time() - start < seconds:
         model.learn(ppo.batch, reset_num_timesteps=False)
     return model.num_timesteps / (time.process_time() - start)
@@ -162,10 +162,11 @@ def main() -> None:
     ours(training, bench, 0.0)  # what there is to compile
     speeds = [(ours(training, bench, arguments.seconds), stable_baselines(training, bench, arguments.seconds))
               for _ in range(TURNS)]  # fmt: skip
-    ratios = [own / other for own, other in speeds]
-    own, other = np.median(speeds, axis=0)
+    ratios = [our_speed / other for our_speed, other in speeds]
+    our_speed, other = np.median(speeds, axis=0)
     print(
-        f"ours {own:,.0f} steps/s, Stable-Baselines3 {other:,.0f} steps/s, of processor time, medians of {TURNS} turns"
+        f"ours {our_speed:,.0f} steps/s, Stable-Baselines3 {other:,.0f} steps/s, of processor time, "
+        f"medians of {TURNS} turns"
     )
     ratio, missed = float(np.median(ratios)), "" if np.median(ratios) >= RATIO else ", **not met**"
     print(
@@ -185,7 +186,7 @@ def main() -> None:
             print(f"seed {seed}, {name}: {worth}, {o.violated.sum()} left, home {o.home.sum()}/40")
     if actors:
         means = [float(o.matrices[:, 0, 0].mean()) for o in actors]
-        left, home = (sum(int(getattr(o, key).sum()) for o in actors) for key in ("left", "home"))
+        left, home = (sum(int(getattr(o, key).sum()) for o in actors) for key in ("violated", "home"))
         print(
             f"| PPO, preset of f_v, {training.ppo.total_steps / 1e6:g} M steps, {len(actors)} seeds: mean weighted "
             f"information on the grid; violations; home | {WORTH:.3e}; 0; all | {min(means):.3e} to {max(means):.3e}; "
