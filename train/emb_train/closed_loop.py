@@ -323,7 +323,8 @@ def advance_one(setup: Setup, e: Experiments, i: int, requested: float) -> None:
 
 def tell(model: Model, estimate: State, told: Floats) -> None:
     """Write the estimates of the parameters in SI units, and then their deviations, shape [8]."""
-    values, widths = believed(model, estimate), deviations(model, estimate)
+    values = believed(model, estimate)
+    widths = deviations(model, estimate, values)
     for j in range(4):
         told[j], told[4 + j] = values[j] * model.nominal[j], widths[j] * model.nominal[j]
 

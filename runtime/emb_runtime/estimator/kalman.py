@@ -232,12 +232,13 @@ def fits(state: State) -> bool:
     return state.worst <= MISFIT
 
 
-def deviations(model: Model, state: State) -> Four:
-    """Standard deviations of the relative parameters; at least the distance of the filter's value from the range.
+def deviations(model: Model, state: State, used: Four) -> Four:
+    """Standard deviations of the relative parameters; at least the distance of the filter's value from the one used.
 
-    Once the model did not fit, at least those of the prior. Infinite where rounding has made a variance negative.
+    That is of :func:`believed`. Once the model did not fit, at least those of the prior. Infinite where rounding has
+    made a variance negative.
     """
-    mean, p, used, doubted = state.mean, state.covariance, believed(model, state), not fits(state)
+    mean, p, doubted = state.mean, state.covariance, not fits(state)
     low, high = model.low, model.high
     return (
         _deviation(p[11], mean[2] - used[0], high[0] - low[0], doubted),

@@ -42,6 +42,6 @@ def test_an_estimate_and_its_current_are_the_frozen_ones() -> None:
         expected = np.array(case["deviations"])
         if state.worst > MISFIT:
             expected = np.maximum(expected, (np.array(model.high) - model.low) / math.sqrt(12.0))
-        assert deviations(model, state) == pytest.approx(expected, rel=1e-15)
+        assert deviations(model, state, believed(model, state)) == pytest.approx(expected, rel=1e-15)
         assert current_for(model, state, believed(model, state), *case["speed"]) == case["current"]
     assert {case["after"][-1] > MISFIT for case in FROZEN["exact"]} == {True, False}

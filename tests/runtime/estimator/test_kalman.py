@@ -16,6 +16,8 @@ from emb_bench.brake.motion import advance, no_sensitivity, rest
 from emb_bench.information.symmetric import Floats, unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, Sensors
 from emb_runtime.estimator.kalman import (
+    Four,
+    Model,
     State,
     believed,
     deviations,
@@ -40,6 +42,10 @@ def state_of(mean: Any, covariance: Floats) -> State:
     packed: Any = tuple(covariance[np.triu_indices(6)].tolist())
     six: Any = tuple(map(float, mean))
     return State(0.0, six, packed, 1.0, 1.0)
+
+
+def errors(model: Model, state: State) -> Four:
+    return deviations(model, state, believed(model, state))
 
 
 def known(x: float, v: float, variance: float = 0.0) -> State:
@@ -207,14 +213,14 @@ def test_a_brake_that_surely_sticks_stands_still_and_tells_nothing_of_the_fricti
         state = follow(EXACT, state, 0.2, 0.0, float(k), 0.1)
     assert abs(state.mean[1]) < 1e-12
     assert state.mean[2:] == pytest.approx(before.mean[2:], abs=1e-12)
-    assert deviations(EXACT, state) == pytest.approx([0.02] * 4, rel=1e-9)
+    assert errors(EXACT, state) == pytest.approx([0.02] * 4, rel=1e-9)
 
 
 def test_where_it_is_not_sure_whether_the_brake_sticks_it_stays_unsure() -> None:
     state = before = follow(EXACT, initial_state(EXACT), 0.0, 0.0, 0.0, 0.0)
     for k in range(1, 40):
         state = follow(EXACT, state, 0.0, 0.0, float(k), EXACT.coulomb / EXACT.motor)  # breaks the nominal one away
-    assert deviations(EXACT, state)[2] > 0.8 * deviations(EXACT, before)[2]
+    assert errors(EXACT, state)[2] > 0.8 * errors(EXACT, before)[2]
 
 
 def test_a_running_mean_of_the_innovations_is_kept_and_its_greatest_value_decides() -> None:
@@ -226,20 +232,20 @@ def test_a_running_mean_of_the_innovations_is_kept_and_its_greatest_value_decide
     assert state.innovation < 2.0
     assert state.worst > 20.0
     sure = known(1.0, 0.0, 1e-8)._replace(worst=1.6)
-    assert deviations(UNEQUAL, sure) == pytest.approx([1e-4] * 4)
+    assert errors(UNEQUAL, sure) == pytest.approx([1e-4] * 4)
     widths = np.subtract(UNEQUAL.high, UNEQUAL.low)
-    assert deviations(UNEQUAL, sure._replace(worst=1.601)) == pytest.approx(widths / math.sqrt(12.0))
+    assert errors(UNEQUAL, sure._replace(worst=1.601)) == pytest.approx(widths / math.sqrt(12.0))
 
 
 def test_values_are_cut_off_at_their_ranges_and_known_no_better_than_by_what_is_cut_off() -> None:
     for beyond, ends in ((-1.0, UNEQUAL.low), (5.0, UNEQUAL.high)):
         state = state_of((0.0, 0.0, *[beyond] * 4), 1e-8 * np.eye(6))
         assert believed(UNEQUAL, state) == ends
-        assert deviations(UNEQUAL, state) == pytest.approx(np.abs(np.subtract(beyond, ends)))
+        assert errors(UNEQUAL, state) == pytest.approx(np.abs(np.subtract(beyond, ends)))
     state = state_of((0.0, 0.0, 0.9, 1.0, 1.1, 1.2), 1e-8 * np.eye(6))
     assert believed(UNEQUAL, state) == (0.9, 1.0, 1.1, 1.2)
-    assert deviations(UNEQUAL, state) == pytest.approx([1e-4] * 4)
+    assert errors(UNEQUAL, state) == pytest.approx([1e-4] * 4)
     broken = state_of(state.mean, -1e-8 * np.eye(6))  # by rounding
-    assert deviations(EXACT, broken) == deviations(EXACT, broken._replace(worst=2.0)) == (math.inf,) * 4
+    assert errors(EXACT, broken) == errors(EXACT, broken._replace(worst=2.0)) == (math.inf,) * 4
     sure = state_of((0.0, 0.0, *UNIT), np.zeros((6, 6)))
-    assert deviations(EXACT, sure) == (0.0,) * 4
+    assert errors(EXACT, sure) == (0.0,) * 4
