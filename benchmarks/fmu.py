@@ -29,7 +29,7 @@ from emb_bench.config.plants import EULER, Mechanics
 from emb_bench.experiment.simulate import Theta
 from emb_bench.export.export import write_model
 from emb_bench.export.identified import Identified
-from emb_bench.sim.open_loop import held, march, trajectory
+from emb_bench.sim.open_loop import march, trajectory, zero_order_hold
 
 PERIODS = 500
 IMPORTER = """
@@ -90,7 +90,7 @@ def main() -> None:
             ]
             references = (ctypes.c_uint * 3)(*(keys[one] for one in ("current", "angle", "velocity")))
             simulated = partial(trajectory, loop, mechanics, bench.brake)
-            simulated(held(np.zeros(2), t_s), origin[1], origin[0], origin[2])  # compiles
+            simulated(zero_order_hold(np.zeros(2), t_s), origin[1], origin[0], origin[2])  # compiles
             rng, worst, rest, ours, peer = np.random.default_rng(1), 0.0, 0, 0.0, 0.0
             for _ in range(count):
                 u, x = profile(rng), np.zeros((PERIODS, 2))
@@ -105,7 +105,7 @@ def main() -> None:
                 )  # fmt: skip
                 ours += time.perf_counter() - begin
                 begin = time.perf_counter()
-                states, _ = simulated(held(u, t_s), origin[1], origin[0], origin[2])
+                states, _ = simulated(zero_order_hold(u, t_s), origin[1], origin[0], origin[2])
                 peer += time.perf_counter() - begin
                 assert not failed
                 worst = max(worst, float((np.abs(x - states[1:, :2]) / np.ptp(states[:, :2], axis=0)).max()))

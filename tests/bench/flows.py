@@ -14,7 +14,7 @@ from emb_bench.config.plants import BUILT_IN, Mechanics, Plant
 from emb_bench.experiment.experiment import planned
 from emb_bench.experiment.simulate import Theta, simulate
 from emb_bench.information.fisher import Fisher, Kind, information_over_time, weights_along
-from emb_bench.sim.open_loop import held, march, trajectory
+from emb_bench.sim.open_loop import march, trajectory, zero_order_hold
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
 
 T_S = 1e-3
@@ -44,7 +44,7 @@ def whole(
     (chosen, s), x = no_sensitivity(params), rest()
     x[:2], x[3] = (x0[0] - contact, x0[1]), current_offset
     acting = currents + current_offset
-    states, sensitivities = trajectory(compiled(march), mechanics, p, held(acting, T_S, late), chosen, x, s)
+    states, sensitivities = trajectory(compiled(march), mechanics, p, zero_order_hold(acting, T_S, late), chosen, x, s)
     states[:, 0] += contact
     return states, sensitivities[1:, :, :2]
 

@@ -41,12 +41,12 @@ def options_of(function: str, record: type[Record], options: Record | None, more
     raise UsageError(f"{function}: expected {record.__name__}, or its fields as keywords, got {options!r:.60}")
 
 
-def require_options(function: str, options: Mapping[str, Any], known: Sequence[str]) -> None:
+def require_options(function: str, options: Mapping[str, Any], names: Sequence[str]) -> None:
     """Refuse an option that a function does not have."""
     for name in options:
-        if name not in known:
+        if name not in names:
             arrays = ", ".join(f"'{name}': {name}" for name, value in options.items() if is_row(value))
-            meant = f"; did you mean {MEANT[name]}?" if MEANT.get(name) in known else near(name, known)
+            meant = f"; did you mean {MEANT[name]}?" if MEANT.get(name) in names else near(name, names)
             table = f"; arrays are a table: {function}({{{arrays}}}, map='map.toml')" if arrays else ""
             raise UsageError(f"{function} has no option '{name}'{table or meant}")
 
@@ -76,7 +76,7 @@ def opened(run: Any, map_path: str | Path | None = None) -> RunLog:
 def _recorded(table: Any, map_path: str | Path | None) -> RunLog:
     """A recording of others in memory, read as the Parquet file that it would be."""
     if map_path is None:
-        raise UsageError("a table needs a map file, which says what its columns are: map='map.toml'")
+        raise UsageError("a table needs a map file for its columns: map='map.toml'")
     from emb_bench.recordings.map_file import read_map
     from emb_bench.recordings.recording import open_recording
 
@@ -85,14 +85,14 @@ def _recorded(table: Any, map_path: str | Path | None) -> RunLog:
     with needs("a table", "bench"):
         import pyarrow as pa
         from pyarrow import parquet
-    with ExitStack() as kept:
-        path = Path(kept.enter_context(TemporaryDirectory()), "table.parquet")
+    with ExitStack() as stack:
+        path = Path(stack.enter_context(TemporaryDirectory()), "table.parquet")
         try:
             parquet.write_table(pa.table(dict(table) if isinstance(table, Mapping) else table), path)
         except (pa.ArrowException, TypeError, ValueError) as err:
             raise UsageError(f"expected columns of numbers, all as long: {' '.join(str(err).split())}") from err
         recording = open_recording(path, Path(map_path))
-        finalize(recording, kept.pop_all().close)  # a report identifies its files
+        finalize(recording, stack.pop_all().close)  # a report identifies its files
     return recording
 
 

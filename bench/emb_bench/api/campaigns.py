@@ -1,4 +1,4 @@
-"""Many logs, each evaluated on its own."""
+"""Many logs, each evaluated alone."""
 
 from __future__ import annotations
 

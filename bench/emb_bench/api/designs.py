@@ -44,7 +44,7 @@ class DesignOptions(Options):
 
 
 def design(options: DesignOptions | None = None, *, told: Callable[[str], object] | None = None, **more: Any) -> Report:
-    """The current sequence with most information about parameters that are known, under the limits of the bench.
+    """Optimal current sequence for given parameters, within the limits of the bench.
 
     Args:
         options: a record of options.
@@ -61,18 +61,18 @@ def design(options: DesignOptions | None = None, *, told: Callable[[str], object
     from emb_bench.experiment.theta import read_theta
     from emb_bench.information.criteria import Criterion
 
-    asked = options_of("design", DesignOptions, options, more)
-    its, names = load_bench(asked.bench), names_of(asked.params)
+    settings = options_of("design", DesignOptions, options, more)
+    its, names = load_bench(settings.bench), names_of(settings.params)
     with needs("a design", "bench"):
         from emb_bench.design.problem import make_problem
         from emb_bench.design.report import make_report
         from emb_bench.design.search import steps_of
         from emb_bench.estimate.expected import IntervalCriterion
-    name: Any = asked.criterion
+    name: Any = settings.criterion
     goal = Criterion(name) if name in ("D", "A", "E") else IntervalCriterion(name)
-    _, brake, _ = read_theta(asked.theta, None, its)
-    kind = cast("Kind", asked.kind)
-    problem = make_problem(its, goal, names, model=asked.model, kind=kind, brake=brake, returns=asked.return_home)
+    _, brake, _ = read_theta(settings.theta, None, its)
+    kind = cast("Kind", settings.kind)
+    problem = make_problem(its, goal, names, model=settings.model, kind=kind, brake=brake, returns=settings.return_home)
     say_if_compiling()
-    with progress("design", steps_of(goal, asked.starts)) as advance:
-        return make_report(its, problem, kind, starts=asked.starts, seed=asked.seed, told=told or advance)
+    with progress("design", steps_of(goal, settings.starts)) as advance:
+        return make_report(its, problem, kind, starts=settings.starts, seed=settings.seed, told=told or advance)

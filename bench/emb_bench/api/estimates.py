@@ -36,24 +36,24 @@ def estimate(runs: AnyRun | Sequence[AnyRun] = (), options: EstimateOptions | No
         more: its fields as keywords: ``estimate(run, params="f_v")``.
 
     Returns:
-        The study; ``study.estimate.theta`` has the values, ``study.conclusions`` what is known of each parameter.
+        The study; ``study.estimate.theta`` has the values, ``study.conclusions`` the conclusion on each parameter.
 
     Raises:
         UsageError: an argument is wrong, the runs do not go together, or scipy and numba are missing.
-        LogError: a log says too little.
+        LogError: a log has too little data.
     """
-    asked = options_of("estimate", EstimateOptions, options, more)
+    settings = options_of("estimate", EstimateOptions, options, more)
     _require_estimates()
-    before = _earlier(asked)
+    before = _earlier(settings)
     from emb_bench.analysis.stages import make_study
 
-    logs = [driven(run, asked.map) for run in listed(runs)]
+    logs = [driven(run, settings.map) for run in listed(runs)]
     if not logs:
         raise UsageError("expected at least one run")
-    its = logs[0].bench if asked.bench is None else load_bench(asked.bench, analysis=True)
+    its = logs[0].bench if settings.bench is None else load_bench(settings.bench, analysis=True)
     say_if_compiling()
     say(f"estimates from {', '.join(log.path.name for log in logs)}")
-    return make_study(its, logs, asked, last=before)
+    return make_study(its, logs, settings, last=before)
 
 
 def report(
@@ -61,13 +61,13 @@ def report(
 ) -> Report:
     """One page about runs of one brake, to hand over, and a JSON file beside it.
 
-    The verdict comes first, then the evidence. The page is one file for screen and paper. A log that cannot be used is
-    named and left out. A run without an experiment is reported without an estimate. With ``compare`` two runs
+    The verdict comes first, then the evidence. The page is one file for screen and paper. An unusable log is
+    named and skipped. A run without an experiment is reported without an estimate. With ``compare`` two runs
     stand side by side, each estimated alone, with the differences of their parameters; the worse verdict counts.
 
     Args:
-        runs: MCAP files of emb-run, of one brake; with a map, recordings of others. What cannot be used is named on
-            the page and left out.
+        runs: MCAP files of emb-run, of one brake; with a map, recordings of others. Unusable ones are named
+            on the page and skipped.
         output: page to write, .html or .htm.
         options: a record of options.
         more: its fields as keywords, those of :func:`estimate` among them.
@@ -82,16 +82,16 @@ def report(
     """
     page = Path(output)
     beside = page.parent / f"{page.stem}.json"
-    asked = options_of("report", ReportOptions, options, more)
-    files = [*(run for run in listed(runs) if not is_table(run)), asked.last, asked.map, asked.acceptance]
+    settings = options_of("report", ReportOptions, options, more)
+    files = [*(run for run in listed(runs) if not is_table(run)), settings.last, settings.map, settings.acceptance]
     for path in (Path(getattr(entry, "path", entry)) for entry in files if entry is not None):
         if path.resolve() in (page.resolve(), beside.resolve()):
             raise UsageError(f"--output {page}: would write over {path}, which is read: choose another name")
     require_place("--output", page, PAGES)
-    require_place("--junit", None if asked.junit is None else Path(asked.junit), (".xml",))
-    if asked.junit is not None and asked.acceptance is None:
+    require_place("--junit", None if settings.junit is None else Path(settings.junit), (".xml",))
+    if settings.junit is not None and settings.acceptance is None:
         raise UsageError("--junit: expected it with --acceptance")
-    if asked.compare and len(listed(runs)) != 2:
+    if settings.compare and len(listed(runs)) != 2:
         raise UsageError(f"--compare: expected two runs, got {len(listed(runs))}")
     _require_estimates()
     with needs("a report", "bench"):
@@ -99,31 +99,31 @@ def report(
     from emb_bench.analysis.stages import make_study, side_by_side
     from emb_bench.report import acceptance as test
     from emb_bench.report.page import html
-    from emb_bench.report.report import Report, document, page_of
+    from emb_bench.report.report import Report, page_of, report_document
 
-    before = _earlier(asked)
-    criteria = None if asked.acceptance is None else test.read_criteria(Path(asked.acceptance))
+    before = _earlier(settings)
+    criteria = None if settings.acceptance is None else test.read_criteria(Path(settings.acceptance))
     say_if_compiling()
     with replacing(page) as new_page, replacing(beside) as new_numbers:
-        logs, left_out = _usable(listed(runs), asked)
+        logs, left_out = _usable(listed(runs), settings)
         say(f"estimates from {', '.join(log.path.name for log in logs)}, and writes {page.name}")
-        own = next((log for log in logs if "bench.toml" in log.attachments), logs[-1])
-        its = own.bench if asked.bench is None else load_bench(asked.bench, analysis=True)
+        with_bench = next((log for log in logs if "bench.toml" in log.attachments), logs[-1])
+        its = with_bench.bench if settings.bench is None else load_bench(settings.bench, analysis=True)
         made_by = f"emb-excite {metadata.version('emb-excite')}"
-        if asked.compare and left_out:
+        if settings.compare and left_out:
             raise LogError("--compare: " + "; ".join(f"{path}: {why}" for path, why in left_out))
-        if asked.compare:
-            study = side_by_side(its, logs, asked)
+        if settings.compare:
+            study = side_by_side(its, logs, settings)
         else:
-            study = make_study(its, logs, asked, last=before, for_report=True)
+            study = make_study(its, logs, settings, last=before, for_report=True)
         made = Report(study, its, left_out, made_by)
-        if criteria is not None and asked.acceptance is not None:
-            accepted = test.accept(criteria, Path(asked.acceptance).name, study, made.without_part)
+        if criteria is not None and settings.acceptance is not None:
+            accepted = test.accept(criteria, Path(settings.acceptance).name, study, made.without_part)
             made = replace(made, acceptance=accepted)
-        new_numbers.write_text(json_document(document(made)) + "\n", encoding="utf-8")
+        new_numbers.write_text(json_document(report_document(made)) + "\n", encoding="utf-8")
         new_page.write_text(html(page_of(made)), encoding="utf-8")
-        if asked.junit is not None and made.acceptance is not None:
-            with replacing(Path(asked.junit)) as new_cases:
+        if settings.junit is not None and made.acceptance is not None:
+            with replacing(Path(settings.junit)) as new_cases:
                 new_cases.write_text(test.junit(made.acceptance), encoding="utf-8")
     return made
 

@@ -27,7 +27,7 @@ class FimOptions(QuestionOptions):
 
     params: Names | None = option(
         None,
-        "parameters of interest; all others are taken as known (default: the four of the brake; of a recording those "
+        "parameters of interest; all others are fixed (default: the four of the brake; of a recording those "
         "that its map guesses)",
         "NAMES",
     )
@@ -52,7 +52,7 @@ class FimOptions(QuestionOptions):
 def fisher_information(
     run: AnyRun | Sequence[AnyRun] | Sequence[float] | Any = (), options: FimOptions | None = None, **more: Any
 ) -> Information:
-    """Fisher information of a run: how precisely its parameters can be known at best.
+    """Fisher information of a run: the smallest possible uncertainties of its parameters.
 
     Intervals are the Cramer-Rao bound for sensors with noise and without systematic errors: no method can do better.
     emb-replay estimate also estimates the systematic errors of the bench file, so its repeatability is larger. -v adds
@@ -71,23 +71,23 @@ def fisher_information(
 
     Raises:
         UsageError: a name is unknown, or the run only listened.
-        LogError: the log says too little.
+        LogError: the log has too little data.
     """
     from emb_bench.experiment.from_log import read_experiment
     from emb_bench.experiment.theta import read_theta
     from emb_bench.information.evaluation import bench_for, default_model, evaluate, expected, together
 
-    asked = options_of("fisher_information", FimOptions, options, more)
-    model, choice = asked.model or asked.plant, asked.parameters if asked.theta is None else asked.theta
+    settings = options_of("fisher_information", FimOptions, options, more)
+    model, choice = settings.model or settings.plant, settings.parameters if settings.theta is None else settings.theta
     if is_row(run):
-        its = load_bench(asked.bench, analysis=True)
+        its = load_bench(settings.bench, analysis=True)
         _, brake, errors = read_theta(choice, None, its)
-        return expected(its, its.model(model or DEFAULT_PLANT), asked.question(its), brake, errors, run)
+        return expected(its, its.model(model or DEFAULT_PLANT), settings.question(its), brake, errors, run)
     found = []
     for entry in listed(run):
-        log = driven(entry, asked.map)
-        its = bench_for(log, asked.bench)
-        question, its_plant = asked.question(its), its.model(model or default_model(log)[0])
+        log = driven(entry, settings.map)
+        its = bench_for(log, settings.bench)
+        question, its_plant = settings.question(its), its.model(model or default_model(log)[0])
         name, brake, errors = read_theta(choice, log, its)
         found += evaluate(log, read_experiment(log, its), its, [its_plant], question, name, brake, errors)
     if not found:
@@ -125,7 +125,7 @@ def sensitivities(
     parameters: Mapping[str, float] | None = None,
     bench: str | Path | None = None,
 ) -> Trajectory:
-    """Motion of a brake under currents from rest at the origin, and how it depends on the parameters.
+    """Motion of a brake under currents from rest at the origin, and its sensitivities to the parameters.
 
     Args:
         currents: one per sample period [A]; limits are not applied.

@@ -17,7 +17,7 @@ from emb_runtime.safety.shield_design import make_law
 def export_policy(policy: Any, output: str | Path, *, bench: str | Path | None = None, kind: str = "current") -> str:
     """Write a policy for ``emb-run`` as one ONNX file with its contract, and check that it computes the same.
 
-    Outputs that are beyond the bench's limit are clipped, which the description says.
+    Outputs beyond the bench's limit are clipped, as stated in the description.
 
     Args:
         policy: an ONNX file, or a torch module, or a function of a tensor: one number, shape [N, 1], for angle,

@@ -36,10 +36,10 @@ class Run(RunLog):
 
     def __getattr__(self, column: str) -> NDArray[Any]:
         """A column of the control cycles: ``run.angle``, ``run.sent_current``."""
-        known = {} if column.startswith("_") or CYCLE not in self.topics else self.tables[CYCLE]
-        if column in known:
-            return known[column]
-        raise AttributeError(f"a run has no {column!r}, and no such column in {CYCLE}{near(column, known)}")
+        columns = {} if column.startswith("_") or CYCLE not in self.topics else self.tables[CYCLE]
+        if column in columns:
+            return columns[column]
+        raise AttributeError(f"a run has no {column!r}, and no such column in {CYCLE}{near(column, columns)}")
 
     def __add__(self, other: Run) -> list[Run]:
         """Runs of one brake, to be taken together: ``estimate(first + second)``."""
@@ -168,10 +168,10 @@ def export(run: AnyRun, output: str | Path, options: ExportOptions | None = None
     from emb_bench.api.estimates import estimate
     from emb_bench.export.export import write
 
-    asked = options_of("export", ExportOptions, options, more)
-    log = opened(run, asked.map)
-    of_fit = {one.name: getattr(asked, one.name) for one in fields(FitOptions)}
-    return write(log, Path(output), asked, lambda: estimate(log, **of_fit))
+    settings = options_of("export", ExportOptions, options, more)
+    log = opened(run, settings.map)
+    of_fit = {one.name: getattr(settings, one.name) for one in fields(FitOptions)}
+    return write(log, Path(output), settings, lambda: estimate(log, **of_fit))
 
 
 def rerun(run: AnyRun) -> Rerun:
@@ -218,7 +218,7 @@ def timing(runs: AnyRun | Sequence[AnyRun]) -> list[RunTiming]:
     """Timing of runs, judged by the budgets of their bench.
 
     How long each part of a control cycle took, by the time stamps in the log: sample to sample, sample to loop,
-    decision, sending, sensor to command, and the time left before the answer would have been late. The times are
+    decision, sending, sensor to command, and the time remaining before the answer would have been late. The times are
     compared with [budgets] of the bench file in the log. Simulated time is not judged.
 
     Args:

@@ -42,13 +42,13 @@ def simulate(
         seed: of the sensors' noise.
         currents: requested in place of a policy, one per sample period [A].
         policy: ONNX file, or currents (default: the shipped actor).
-        quick: the shipped actor for a short experiment, until all four parameters are known to about 1 %.
+        quick: the shipped actor for a short experiment, until the repeatability of all four parameters is about 1 %.
         bench: bench file (default: the shipped one).
         duration: of the experiment [s] (default: that of the currents, or the policy's horizon).
         more_parameters: true parameters as keywords: ``f_v=3e-5``.
 
     Returns:
-        The run, opened; :attr:`~emb_bench.logs.log.RunLog.exit_reason` says how it ended.
+        The run, opened; :attr:`~emb_bench.logs.log.RunLog.exit_reason` has its end.
 
     Raises:
         EmbError: an argument is wrong, the policy does not fit the bench, or the log cannot be written.
@@ -66,30 +66,30 @@ def simulate(
         raise UsageError("currents: expected them without policy and without quick")
     require_options("simulate", more_parameters, (*PARAMETER_NAMES, *NOISES, *CONDITIONS, *_OPTIONS))
     brake = {"plant": plant, "seed": seed, **(parameters or {}), **more_parameters}
-    own = Path(mkdtemp(prefix="emb-run-")) if log is None else None
-    path = Path(log or f"{own}/run.mcap")
+    temporary = Path(mkdtemp(prefix="emb-run-")) if log is None else None
+    path = Path(log or f"{temporary}/run.mcap")
     try:
         with TemporaryDirectory() as folder:
             if currents is not None:
                 policy, duration = _policy_of(currents, bench, Path(folder), duration)
-            asked = parser().parse_args([])
-            asked.iface = "sim:" + ",".join(f"{name}={value}" for name, value in brake.items())
-            asked.policy, asked.bench = (None if name is None else Path(name) for name in (policy, bench))
-            asked.duration, asked.quick, asked.log = duration, quick, path
+            arguments = parser().parse_args([])
+            arguments.iface = "sim:" + ",".join(f"{name}={value}" for name, value in brake.items())
+            arguments.policy, arguments.bench = (None if name is None else Path(name) for name in (policy, bench))
+            arguments.duration, arguments.quick, arguments.log = duration, quick, path
             given = {"policy": policy, "bench": bench, "duration": duration}
-            asked.typed = ["--iface", asked.iface, "--log", str(path)]
+            arguments.typed = ["--iface", arguments.iface, "--log", str(path)]
             for name, value in given.items():
-                asked.typed += [] if value is None else [f"--{name}", str(value)]
-            asked.typed += ["--quick"] if quick else []
-            plan = prepare(asked)
+                arguments.typed += [] if value is None else [f"--{name}", str(value)]
+            arguments.typed += ["--quick"] if quick else []
+            plan = prepare(arguments)
             experiment(plan, path, Console(), open_brake(brake_of(brake, plan.bench, "sim: "), plan.bench))
         run = open_run(path)
     except BaseException:
-        if own is not None:
-            shutil.rmtree(own)
+        if temporary is not None:
+            shutil.rmtree(temporary)
         raise
-    if own is not None:
-        delete_with(run, own)
+    if temporary is not None:
+        delete_with(run, temporary)
     return run
 
 

@@ -40,8 +40,8 @@ def stiffness(p: BrakeParameters, x1: float) -> float:
 def torque(p: BrakeParameters, x1: float, x2: float, u: float, i: int) -> float:
     """The torque that parameter ``i`` of ``PARAMETERS`` scales, signed as it acts on the motor (eq. 3.12-3.14) [N·m].
 
-    It is also θ_i times its own derivative with respect to θ_i. The inertia scales no torque but what all together
-    do: its share is −J ẍ. The derivatives to the angle of contact [N·m/rad] and to an offset of the current [N·m/A] are
+    It is also θ_i times its derivative with respect to θ_i. The inertia scales the acceleration: its share is −J ẍ. The
+    derivatives to the angle of contact [N·m/rad] and to an offset of the current [N·m/A] are
     absolute; any other parameter has none, 0.
     """
     if i == K_M:
@@ -69,7 +69,7 @@ def acceleration(p: BrakeParameters, x1: float, x2: float, u: float) -> float:
 
 
 def step(p: BrakeParameters, x1: float, x2: float, u: float, t_s: float) -> tuple[float, float]:
-    """Angle and velocity after one Euler step (eq. 4.1) under a held current; limits are the caller's."""
+    """Angle and velocity after one Euler step (eq. 4.1) with a constant current; limits are the caller's."""
     return x1 + t_s * x2, x2 + t_s * acceleration(p, x1, x2, u)
 
 
@@ -86,12 +86,12 @@ def sensitivity_step(
     return s1 + t_s * s2, s2 + t_s * ((torque(p, x1, x2, u, i) - restoring) / p.J)
 
 
-def advance_euler(p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any, s: Any) -> None:
+def advance_euler(p: BrakeParameters, x: Any, u: float, t_s: float, unknowns: Any, s: Any) -> None:
     """One sample period, in place; arguments are those of :func:`emb_bench.brake.motion.advance`."""
     x1, x2 = float(x[0]), float(x[1])
-    for j in range(chosen.shape[0]):
-        s[j, 0], s[j, 1] = sensitivity_step(p, x1, x2, u, t_s, float(s[j, 0]), float(s[j, 1]), int(chosen[j]))
-        if chosen[j] == DELAY:  # by a fraction of a sample: a share of the step with the current before
+    for j in range(unknowns.shape[0]):
+        s[j, 0], s[j, 1] = sensitivity_step(p, x1, x2, u, t_s, float(s[j, 0]), float(s[j, 1]), int(unknowns[j]))
+        if unknowns[j] == DELAY:  # by a fraction of a sample: a share of the step with the current before
             s[j, 1] += t_s * p.k_m * (x[3] - u) / p.J
     x[0], x[1] = step(p, x1, x2, u, t_s)
     x[3] = u

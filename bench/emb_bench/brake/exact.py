@@ -1,14 +1,14 @@
 """The thesis's brake solved exactly between events, and its sensitivities with their jumps.
 
-Under a held current the brake of eq. 3.12-3.14 is linear as long as it keeps its side of contact (x1 = 0) and its
-direction of motion, or sticks. Within such a segment the solution is its own Taylor series: from the second one on,
+With a constant current the brake of eq. 3.12-3.14 is linear as long as it stays on one side of contact (x1 = 0) and
+keeps its direction of motion, or sticks. The solution in such a segment is a Taylor series: from the second one on,
 each derivative of the angle follows from the two before it, D_{n+2} = −(f_v/J) D_{n+1} − (γ k_1/J) D_n. Segments are
-short against the brake's time constants, so that eight terms are exact to rounding; sensitivities obey the same
-recursion with the motion itself as what drives them (eq. 4.23).
+short against the brake's time constants, so that eight terms are exact to rounding. Sensitivities obey the same
+recursion, forced by the motion (eq. 4.23).
 
 Segments end at events, found as roots of the series:
 
-- *contact* is made or left: the clamping force is zero there, so nothing jumps;
+- *contact* begins or ends: the clamping force is zero there, so nothing jumps;
 - the velocity comes to zero, and the brake *sticks*, for the torque on it is no larger than T_c: it stays where it is
   until the current changes, and its velocity depends on no parameter;
 - or it *reverses*: the acceleration jumps from a⁻ to a⁺, and the sensitivity of the velocity by the factor a⁺/a⁻, the
@@ -39,13 +39,13 @@ from emb_runtime.config.bench import BrakeParameters
 
 TERMS = 8  # Of the series
 LONGEST = 0.05
-"""Longest segment, times the rate at which the derivatives grow: the first term left out is below 1e-16 of the rest."""
+"""Longest segment, times the rate at which the derivatives grow: the first omitted term is below 1e-16 of the sum."""
 _ITERATIONS = 60  # of a root search; Newton needs 3 to 5, bisection alone 55
-_ROUNDING = 1e-15  # of a segment's length: no time within it can be told more exactly
+_ROUNDING = 1e-15  # resolution of the time, over a segment's length
 
 
 def advance_exact(
-    p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any, s: Any, viscous_asymmetry: float = 0.0
+    p: BrakeParameters, x: Any, u: float, t_s: float, unknowns: Any, s: Any, viscous_asymmetry: float = 0.0
 ) -> None:
     """One sample period, in place; arguments are those of :func:`emb_bench.brake.motion.advance`.
 
@@ -53,22 +53,22 @@ def advance_exact(
     """
     drive, spring = p.k_m * u / p.J, p.gamma * p.k_1 / p.J
     coulomb, viscous = p.T_c / p.J, p.f_v / p.J
-    _delayed_switch(p, x, u, t_s, chosen, s)
+    _delayed_switch(p, x, u, t_s, unknowns, s)
     x1, x2 = float(x[0]), float(x[1])
-    left = t_s
-    while left > 0.0:
+    remaining = t_s
+    while remaining > 0.0:
         pull = drive - spring * max(x1, 0.0)
         ahead = x2 if x2 != 0.0 else pull
         direction = 1.0 if ahead > 0.0 else -1.0
         damping = viscous * (1.0 + direction * viscous_asymmetry)
         if x2 == 0.0 and abs(pull) <= coulomb:
-            for j in range(chosen.shape[0]):
+            for j in range(unknowns.shape[0]):
                 s[j, 1] = 0.0
             break
         touching = x1 > 0.0 or (x1 == 0.0 and direction > 0.0)
         w = spring if touching else 0.0
         a = pull - direction * coulomb - damping * x2
-        t = min(left, LONGEST / (damping + math.sqrt(spring)))
+        t = min(remaining, LONGEST / (damping + math.sqrt(spring)))
         y1, y2, b = glide(damping, w, x1, x2, a, t)
         stops = y2 * direction <= 0.0
         if stops and x2 != 0.0:
@@ -78,18 +78,18 @@ def advance_exact(
             t = _crossing(damping, w, x1, x2, a, t, False)
             y1, y2, b = glide(damping, w, x1, x2, a, t)
             y1, stops = 0.0, y2 == 0.0
-        for j in range(chosen.shape[0]):
+        for j in range(unknowns.shape[0]):
             s[j, 0], s[j, 1] = _glide_sensitivity(
-                damping, w, p, u, x1, x2, a, direction, coulomb, s[j, 0], s[j, 1], int(chosen[j]), t
+                damping, w, p, u, x1, x2, a, direction, coulomb, s[j, 0], s[j, 1], int(unknowns[j]), t
             )
         if stops:
             after = _acceleration_from_rest(drive - spring * max(y1, 0.0), coulomb)
             factor = after / b if b * direction < 0.0 else 0.0
-            for j in range(chosen.shape[0]):
+            for j in range(unknowns.shape[0]):
                 s[j, 1] *= factor
             y2 = 0.0
         x1, x2 = y1, y2
-        left -= t
+        remaining -= t
     x[0], x[1], x[3] = x1, x2, u
 
 
@@ -167,10 +167,10 @@ def _acceleration_from_rest(pull: float, coulomb: float) -> float:
     return 0.0 if abs(pull) <= coulomb else pull - math.copysign(coulomb, pull)
 
 
-def _delayed_switch(p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any, s: Any) -> None:
-    """Adds what a later switch does to the sensitivity to a delay: the command before it acts for that time."""
-    for j in range(chosen.shape[0]):
-        if chosen[j] == DELAY:
+def _delayed_switch(p: BrakeParameters, x: Any, u: float, t_s: float, unknowns: Any, s: Any) -> None:
+    """Adds the effect of a later switch to the sensitivity to a delay: the previous command acts meanwhile."""
+    for j in range(unknowns.shape[0]):
+        if unknowns[j] == DELAY:
             spring, coulomb = p.gamma * p.k_1 / p.J * max(x[0], 0.0), p.T_c / p.J
             before, now = p.k_m * x[3] / p.J - spring, p.k_m * u / p.J - spring
             if x[1] != 0.0:
@@ -184,10 +184,10 @@ def _delayed_switch(p: BrakeParameters, x: Any, u: float, t_s: float, chosen: An
 
 
 def late_start(before: float, caught: float, now: float) -> float:
-    """Velocity that a brake at rest loses or gains per time by which a command comes later [rad/s²].
+    """Change of velocity of a brake at rest per delay of a command [rad/s²].
 
-    Accelerations: ``before`` from rest under the command before, 0 if it sticks; ``caught`` under the new command of a
-    brake that slides slowly as the one before has it; ``now`` from rest under the new command.
+    Accelerations: ``before`` from rest under the previous command, 0 if it sticks; ``caught`` under the new command at
+    slow sliding in the direction of the previous one; ``now`` from rest under the new command.
     """
     if before == 0.0 or caught == 0.0:
         return -now
@@ -197,8 +197,8 @@ def late_start(before: float, caught: float, now: float) -> float:
 def _crossing(damping: float, w: float, x1: float, x2: float, a: float, t: float, of_velocity: bool) -> float:
     """Time at which the velocity, or else the angle, comes to zero in a segment at whose ends its signs differ [s].
 
-    It is monotone in between. The angle is because the velocity keeps its sign. The velocity is because one that falls
-    goes on falling: where its slope is zero it bends towards zero, v'' = −(γ k_1/J) v.
+    It is monotone in between: the angle because the velocity keeps its sign; the velocity because at a zero slope it
+    bends towards zero, v'' = −(γ k_1/J) v.
     """
     start, slope = (x2, a) if of_velocity else (x1, x2)
     low, high = 0.0, t

@@ -2,18 +2,18 @@
 
 Between events the brake slides smoothly (:mod:`emb_bench.brake.runge_kutta`) or sticks. Steps end at events, found as
 roots in the step's length to the last digits; a step also ends where the acceleration changes its sign, so that the
-velocity is monotone within each and no stop is overlooked. What happens to the sensitivities at events (Leine and
-Nijmeijer, Dynamics and Bifurcations of Non-Smooth Mechanical Systems, 2004, chapter 7), t* being their time:
+velocity is monotone within each and no stop is overlooked. Jumps of the sensitivities at events (Leine and Nijmeijer,
+Dynamics and Bifurcations of Non-Smooth Mechanical Systems, 2004, chapter 7), with t* the time of the event:
 
 - the brake *stops* and sticks: that of the velocity is zero from then on;
 - it *reverses*: that of the velocity jumps by the factor a⁺/a⁻;
 - it *breaks away* within a period, for the current comes with a lag. At g = |k_m i − γ F_cl| − T_s = 0, so
   ∂t*/∂θ = −(∂g/∂θ)/(dg/dt), and the velocity's sensitivity is −a⁺ ∂t*/∂θ. With a Stribeck velocity a⁺ = 0: it parts
   gently. Without a lag it breaks away at the beginning of a period, which depends on no parameter;
-- *contact* is made or left: the force is zero, so the motion's sensitivities go on. w begins at 0 in the angle where
-  contact is made, so that its own becomes that of (x1 − contact)/hysteresis_travel; and it ends with the contact;
-- w *saturates*: the force is continuous, so the motion's go on; that of w is zero from then on, and to the play, whose
-  half it is then, ±play/2. With play contact depends on no more than the angle and w, so that w's goes on there.
+- *contact* begins or ends: the force is zero, so the motion's sensitivities are continuous. w begins at 0 with the
+  contact, so that its sensitivity becomes that of (x1 − contact)/hysteresis_travel; and it ends with the contact;
+- w *saturates*: the force is continuous, and so are the motion's sensitivities; those of w become zero, except that to
+  the play: w is then ±play/2. With play the contact depends on angle and w alone, and w's sensitivity is continuous.
 
 A brake that starts at rest exactly where contact begins counts as one that makes contact: w's derivative to ``contact``
 and ``x1_0`` is that of a brake that starts just outside.
@@ -21,7 +21,7 @@ and ``x1_0`` is that of a brake that starts just outside.
 Accuracy: the velocity's local error is below ``tolerance``, 1e-8 rad/s, by the lower order of the pair. Over 500 ms of
 random currents the states were within 5e-9 rad and 1e-7 rad/s of those with a tolerance of 1e-12, far below the
 sensors' 1e-3 rad and 1 rad/s; sensitivities within 3e-7 of their largest value, and within 1e-4 for a Stribeck
-exponent that is not a whole number, for then the curve is not smooth at rest. Without features all agrees with the
+exponent that is not an integer, for then the curve is not smooth at rest. Without features all values agree with the
 exact brake to 1e-9.
 """
 
@@ -70,40 +70,40 @@ _VELOCITY = 1
 _ACCELERATION = 2
 
 
-def advance_extended(m: Mechanics, p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any, s: Any) -> None:
+def advance_extended(m: Mechanics, p: BrakeParameters, x: Any, u: float, t_s: float, unknowns: Any, s: Any) -> None:
     """One sample period, in place; arguments are those of :func:`emb_bench.brake.motion.advance`."""
-    i = _switch(m, p, x, u, t_s, chosen, s)
-    left, longest = t_s, t_s
-    while left > 0.0:
+    i = _switch(m, p, x, u, t_s, unknowns, s)
+    remaining, longest = t_s, t_s
+    while remaining > 0.0:
         if x[1] == 0.0:
-            held = min(_holds(m, p, float(x[0]), float(x[2]), i, u), left)
-            if held > 0.0:
-                i = _hold(m, p, x, i, u, held, held < left, t_s, chosen, s)
-                left -= held
-                if left <= 0.0:
+            sticking = min(_sticking_time(m, p, float(x[0]), float(x[2]), i, u), remaining)
+            if sticking > 0.0:
+                i = _stick(m, p, x, i, u, sticking, sticking < remaining, t_s, unknowns, s)
+                remaining -= sticking
+                if remaining <= 0.0:
                     break
-        a, before, edge = _begin(m, p, x, i, u, chosen, s)
+        a, before, edge = _begin(m, p, x, i, u, unknowns, s)
         if a.x2 == 0.0 and m.stribeck_velocity > 0.0:
             longest = FIRST
-        found, h, longest = _try(m, p, a, before, min(left, longest))
+        found, h, longest = _try(m, p, a, before, min(remaining, longest))
         found, h, reaches = _cut(m, p, a, before, edge, found, h)
-        _vary_all(m, p, a, found, h, t_s, chosen, s)
+        _vary_all(m, p, a, found, h, t_s, unknowns, s)
         i = current(m, i, u, h)
-        _arrive(m, x, a, found, edge, reaches, chosen, s)
+        _arrive(m, x, a, found, edge, reaches, unknowns, s)
         if found.x2 * a.direction <= 0.0:
-            _stop(m, p, x, i, found.acceleration, a.direction, chosen, s)
-        left -= h
+            _stop(m, p, x, i, found.acceleration, a.direction, unknowns, s)
+        remaining -= h
     x[3] = i
 
 
-def _switch(m: Mechanics, p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any, s: Any) -> float:
+def _switch(m: Mechanics, p: BrakeParameters, x: Any, u: float, t_s: float, unknowns: Any, s: Any) -> float:
     """Switches to the new command; current at the beginning of the period [A]."""
     if m.current_lag > 0.0:
-        for j in range(chosen.shape[0]):
-            s[j, 3] = current_share(m, float(x[3]), u, 0.0, s[j, 3], t_s, int(chosen[j]))
+        for j in range(unknowns.shape[0]):
+            s[j, 3] = current_share(m, float(x[3]), u, 0.0, s[j, 3], t_s, int(unknowns[j]))
         return float(x[3])
-    for j in range(chosen.shape[0]):
-        if chosen[j] == DELAY:
+    for j in range(unknowns.shape[0]):
+        if unknowns[j] == DELAY:
             force = _force(m, p, float(x[0]), float(x[2]))
             before, now = p.k_m * x[3] - p.gamma * force, p.k_m * u - p.gamma * force
             if x[1] == 0.0:
@@ -123,7 +123,7 @@ def _force(m: Mechanics, p: BrakeParameters, x1: float, w: float) -> float:
     return clamping_force(m, p, x1, w) if travel(m, x1, w) > 0.0 else 0.0
 
 
-def _holds(m: Mechanics, p: BrakeParameters, x1: float, w: float, i: float, u: float) -> float:
+def _sticking_time(m: Mechanics, p: BrakeParameters, x1: float, w: float, i: float, u: float) -> float:
     """Time for which a brake at rest sticks while the current goes from ``i`` to ``u``: from 0.0 to infinity [s]."""
     force = _force(m, p, x1, w)
     static, load = static_torque(m, p, force), p.gamma * force
@@ -138,7 +138,7 @@ def _holds(m: Mechanics, p: BrakeParameters, x1: float, w: float, i: float, u: f
     return max(0.0, m.current_lag * math.log((i - u) / gap))
 
 
-def _hold(
+def _stick(
     m: Mechanics,
     p: BrakeParameters,
     x: Any,
@@ -147,7 +147,7 @@ def _hold(
     t: float,
     breaks: bool,
     t_s: float,
-    chosen: Any,
+    unknowns: Any,
     s: Any,
 ) -> float:
     """Keeps the brake at rest for the time ``t``, after which it may break away; current at the end [A]."""
@@ -158,19 +158,19 @@ def _hold(
     direction = math.copysign(1.0, u - i)
     loaded = 1.0 if travel(m, x1, w) > 0.0 else 0.0
     at = stage(m, p, Slide(direction, x1, 0.0, w, 0.0, loaded, after, after), 0.0, x1, 0.0, 1.0)
-    for j in range(chosen.shape[0]):
+    for j in range(unknowns.shape[0]):
         s[j, 1] = 0.0
-        s[j, 3] = current_share(m, i, u, t, s[j, 3], t_s, int(chosen[j]))
+        s[j, 3] = current_share(m, i, u, t, s[j, 3], t_s, int(unknowns[j]))
         if breaks:
             margin = at.per_angle * s[j, 0] + at.per_w * s[j, 2]
-            margin += forcing(m, p, direction, at, int(chosen[j]), s[j, 3])
+            margin += forcing(m, p, direction, at, int(unknowns[j]), s[j, 3])
             growth = p.k_m * (u - after) / m.current_lag / p.J
             s[j, 1] = direction * parting * margin / growth
     return after
 
 
 def _begin(
-    m: Mechanics, p: BrakeParameters, x: Any, i: float, u: float, chosen: Any, s: Any
+    m: Mechanics, p: BrakeParameters, x: Any, i: float, u: float, unknowns: Any, s: Any
 ) -> tuple[Slide, float, float]:
     """The step that begins here, its acceleration [rad/s²], and the angle at which its laws end [rad]."""
     x1, x2, w = float(x[0]), float(x[1]), float(x[2])
@@ -183,8 +183,8 @@ def _begin(
         loaded = clamp > 0.0 or (clamp == 0.0 and direction > 0.0)
         rate = rate if loaded else 0.0
     if x1 == 0.0 and loaded and m.play == 0.0:
-        for j in range(chosen.shape[0]):
-            s[j, 2] = rate * (s[j, 0] - (1.0 if chosen[j] == CONTACT else 0.0))
+        for j in range(unknowns.shape[0]):
+            s[j, 2] = rate * (s[j, 0] - (1.0 if unknowns[j] == CONTACT else 0.0))
     a = Slide(direction, x1, x2, w, rate, 1.0 if loaded else 0.0, i, u)
     before = acceleration(m, p, a, 0.0, x1, x2)
     if x2 == 0.0 and before * direction < 0.0:  # by rounding, at the limit of sticking
@@ -254,21 +254,21 @@ def _value(at: Step, which: int) -> float:
 
 
 def _vary_all(
-    m: Mechanics, p: BrakeParameters, a: Slide, found: Step, h: float, t_s: float, chosen: Any, s: Any
+    m: Mechanics, p: BrakeParameters, a: Slide, found: Step, h: float, t_s: float, unknowns: Any, s: Any
 ) -> None:
     """Take the sensitivities along a step."""
-    if chosen.shape[0] == 0:
+    if unknowns.shape[0] == 0:
         return
     at = stages(m, p, a, found.angles, found.velocities, h)
-    for j in range(chosen.shape[0]):
-        unknown, start = int(chosen[j]), float(s[j, 0])
+    for j in range(unknowns.shape[0]):
+        unknown, start = int(unknowns[j]), float(s[j, 0])
         before = (start, float(s[j, 1]), float(s[j, 2]), float(s[j, 3]))
         s[j, 0], s[j, 1] = vary(m, p, a, at, h, unknown, before, t_s)
         s[j, 2] += a.rate * (s[j, 0] - start)
         s[j, 3] = current_share(m, a.i, a.u, h, before[3], t_s, unknown)
 
 
-def _arrive(m: Mechanics, x: Any, a: Slide, found: Step, edge: float, reaches: bool, chosen: Any, s: Any) -> None:
+def _arrive(m: Mechanics, x: Any, a: Slide, found: Step, edge: float, reaches: bool, unknowns: Any, s: Any) -> None:
     """Write the end of a step to the state; at the ``edge`` the contact changes or w saturates."""
     limit = stop_limit(m)
     x[0], x[1] = found.x1, found.x2
@@ -281,17 +281,17 @@ def _arrive(m: Mechanics, x: Any, a: Slide, found: Step, edge: float, reaches: b
         s[:, 2] = 0.0
     elif a.rate > 0.0:
         x[2] = a.direction * limit
-        for j in range(chosen.shape[0]):
-            s[j, 2] = a.direction * limit if chosen[j] == PLAY else 0.0
+        for j in range(unknowns.shape[0]):
+            s[j, 2] = a.direction * limit if unknowns[j] == PLAY else 0.0
 
 
 def _stop(
-    m: Mechanics, p: BrakeParameters, x: Any, i: float, before: float, direction: float, chosen: Any, s: Any
+    m: Mechanics, p: BrakeParameters, x: Any, i: float, before: float, direction: float, unknowns: Any, s: Any
 ) -> None:
     """Stops or reverses a brake whose velocity came to zero from ``direction``, decelerated by ``before`` [rad/s²]."""
     force = _force(m, p, float(x[0]), float(x[2]))
     after = acceleration_from_rest(m, p, p.k_m * i - p.gamma * force, force)
     factor = after / before if before * direction < 0.0 else 0.0
-    for j in range(chosen.shape[0]):
+    for j in range(unknowns.shape[0]):
         s[j, 1] *= factor
     x[1] = 0.0

@@ -8,7 +8,7 @@ velocity v, eq. 3.5 with the static friction of eq. 3.6:
 Eq. 3.5 prints (T_s − T_c sign(v)) without a sign before it, which would make friction drive a brake that moves
 backwards; eq. 3.8, figure 3.3 and the reference (Armstrong-Hélouvry, Dupont and Canudas de Wit, Automatica 30, 1994,
 section 4) have it as above. A brake at rest holds any torque up to T_s. Without a Stribeck velocity the static friction
-acts at rest only, and a brake that breaks away is at once left with T_c.
+acts at rest only, and the friction falls to T_c at break-away.
 
 **Clamping force**: cubic in the angle, and another on applying than on releasing. Eq. 3.9 with the slope at contact as
 k_1, F_cl = k_1 x (1 + quadratic x + cubic x²) for x ≥ 0, the angle from contact, and none outside. Two features make it
@@ -53,7 +53,7 @@ def static_torque(m: Mechanics, p: BrakeParameters, force: float) -> float:
 
 
 def decay(m: Mechanics, speed: float) -> float:
-    """Share of the static friction beyond T_c that is left at a speed, of either sign [rad/s]."""
+    """Stribeck factor e: remaining share of the static friction beyond T_c at a speed, of either sign [rad/s]."""
     if m.stribeck_velocity == 0.0:
         return 0.0
     ratio = abs(speed / m.stribeck_velocity)
@@ -61,37 +61,37 @@ def decay(m: Mechanics, speed: float) -> float:
     return math.exp(-power)
 
 
-def decay_slope(m: Mechanics, speed: float, left: float) -> float:
-    """Derivative of :func:`decay`, whose value is ``left``, along the speed if that is positive [s/rad]."""
+def decay_slope(m: Mechanics, speed: float, stribeck: float) -> float:
+    """Derivative of :func:`decay`, whose value is ``stribeck``, along the speed if that is positive [s/rad]."""
     if m.stribeck_velocity == 0.0:
         return 0.0
     ratio = abs(speed / m.stribeck_velocity)
     power: float = ratio if m.stribeck_exponent == 2.0 else ratio ** (m.stribeck_exponent - 1.0)
-    return -m.stribeck_exponent / m.stribeck_velocity * power * left
+    return -m.stribeck_exponent / m.stribeck_velocity * power * stribeck
 
 
-def sliding_torque(m: Mechanics, p: BrakeParameters, speed: float, force: float, left: float) -> float:
-    """Friction against the motion (eq. 3.5) [N·m]; ``left`` is :func:`decay` at this speed, 1 for the static one."""
-    return p.T_c + (static_torque(m, p, force) - p.T_c) * left + p.f_v * speed
+def sliding_torque(m: Mechanics, p: BrakeParameters, speed: float, force: float, stribeck: float) -> float:
+    """Friction against the motion (eq. 3.5) [N·m]; ``stribeck`` is :func:`decay` at this speed, 1 if static."""
+    return p.T_c + (static_torque(m, p, force) - p.T_c) * stribeck + p.f_v * speed
 
 
-def sliding_slope(m: Mechanics, p: BrakeParameters, speed: float, force: float, left: float) -> float:
+def sliding_slope(m: Mechanics, p: BrakeParameters, speed: float, force: float, stribeck: float) -> float:
     """Derivative of :func:`sliding_torque` along the speed: below f_v where friction falls with speed [N·m·s/rad]."""
-    return (static_torque(m, p, force) - p.T_c) * decay_slope(m, speed, left) + p.f_v
+    return (static_torque(m, p, force) - p.T_c) * decay_slope(m, speed, stribeck) + p.f_v
 
 
-def sliding_share(m: Mechanics, p: BrakeParameters, speed: float, force: float, left: float, i: int) -> float:
+def sliding_share(m: Mechanics, p: BrakeParameters, speed: float, force: float, stribeck: float, i: int) -> float:
     """θ_i ∂/∂θ_i of :func:`sliding_torque` at constant speed and force [N·m]."""
     if i == T_C:
-        return p.T_c * (1.0 + (m.break_away - 1.0) * left)
+        return p.T_c * (1.0 + (m.break_away - 1.0) * stribeck)
     if i == F_V:
         return p.f_v * speed
     if i == BREAK_AWAY:
-        return m.break_away * p.T_c * left
+        return m.break_away * p.T_c * stribeck
     if i == STRIBECK_VELOCITY:
-        return -(static_torque(m, p, force) - p.T_c) * decay_slope(m, speed, left) * speed
+        return -(static_torque(m, p, force) - p.T_c) * decay_slope(m, speed, stribeck) * speed
     if i == F_L:
-        return m.f_l * force * left
+        return m.f_l * force * stribeck
     return 0.0
 
 
@@ -108,12 +108,11 @@ def parting_acceleration(m: Mechanics, p: BrakeParameters, force: float) -> floa
 
 
 SATURATED = 1.0 - 1e-9
-"""Share of its limit from which on w counts as saturated: what is missing would not be seen in the angle's last
-digits."""
+"""Share of its limit above which w counts as saturated: the rest is below the angle's last digits."""
 
 
 def travel(m: Mechanics, x1: float, w: float) -> float:
-    """Angle of the clamp from contact; the motor's own but for the play [rad]."""
+    """Angle of the clamp from contact [rad]: that of the motor, less the lag with play."""
     return x1 - w if m.play > 0.0 else x1
 
 

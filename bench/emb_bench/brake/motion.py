@@ -23,23 +23,23 @@ Integers = NDArray[np.int64]
 STATES = 4
 """Angle [rad], velocity [rad/s], position in the hysteresis −1..1 or with play the lag of the clamp behind the motor
 [rad], current in the motor [A]."""
-SENSITIVE = 4  # Sensitivities of the same, in this order. That of the current is kept where the current has a lag.
+SENSITIVE = 4  # Sensitivities of the same, in this order; that of the current only with a lag of the current
 
 
 def advance(
-    mechanics: Mechanics, p: BrakeParameters, x: Floats, u: float, t_s: float, chosen: Integers, s: Floats
+    mechanics: Mechanics, p: BrakeParameters, x: Floats, u: float, t_s: float, unknowns: Integers, s: Floats
 ) -> None:
-    """One sample period under a held current, in place.
+    """One sample period with a constant current, in place.
 
-    Without a current lag x[3] is the current of the period before. ``chosen`` are indices in ``PARAMETERS`` of the n
+    Without a current lag x[3] is the current of the period before. ``unknowns`` are indices in ``PARAMETERS`` of the n
     unknowns; ``s``, shape (n, SENSITIVE), are the sensitivities of the states to them.
     """
     if mechanics.solver == EULER:
-        advance_euler(p, x, u, t_s, chosen, s)
+        advance_euler(p, x, u, t_s, unknowns, s)
     elif is_plain(mechanics) or mechanics.viscous_asymmetry != 0.0:  # which goes with no other feature
-        advance_exact(p, x, u, t_s, chosen, s, mechanics.viscous_asymmetry)
+        advance_exact(p, x, u, t_s, unknowns, s, mechanics.viscous_asymmetry)
     else:
-        advance_extended(mechanics, p, x, u, t_s, chosen, s)
+        advance_extended(mechanics, p, x, u, t_s, unknowns, s)
 
 
 PLAIN = Mechanics()
@@ -61,8 +61,8 @@ def no_sensitivity(params: Sequence[str]) -> tuple[Integers, Floats]:
     Raises:
         ValueError: a name is not in ``PARAMETERS``.
     """
-    chosen = np.array([list(PARAMETERS).index(name) for name in params], np.int64)
-    s = np.zeros((len(chosen), SENSITIVE))
-    s[chosen == X1_0, 0] = 1.0
-    s[chosen == X2_0, 1] = 1.0
-    return chosen, s
+    unknowns = np.array([list(PARAMETERS).index(name) for name in params], np.int64)
+    s = np.zeros((len(unknowns), SENSITIVE))
+    s[unknowns == X1_0, 0] = 1.0
+    s[unknowns == X2_0, 1] = 1.0
+    return unknowns, s

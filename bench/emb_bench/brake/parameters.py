@@ -1,10 +1,10 @@
 """The one table of what can be estimated from a record: parameters of a brake, of its features and its instruments.
 
-The thesis identifies k_m, k_1, T_c and f_v. The others are what the record depends on besides: nuisances that are
-estimated too, or constants whose error has a price. All that the tool says or does with a parameter by its name
-follows from its row here: index, unit, range of a search, score test, remedy.
+The thesis identifies k_m, k_1, T_c and f_v. The record also depends on nuisance parameters, which are estimated, and on
+constants, whose errors enter the uncertainty. The row of a parameter has its unit, search range, score test and remedy;
+its place is the index in compiled code.
 
-A machine that is no brake has names and units of its own: a linear servo has a mass in kg, not an inertia in kg·m².
+A machine that is no brake has other names and units: a linear servo has a mass in kg, not an inertia in kg·m².
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ class Parameter(NamedTuple):
     unit: str  # Of its value, SI; ``1`` for a number
     relative: bool = True  # Its sensitivity is θ ∂/∂θ (eq. 4.17); False for an absolute one, per unit
     about: str = ""  # What it is
-    low: float = 0.0  # Lowest value that is searched; where low = high, limits of the bench
-    high: float = 0.0  # Highest value that is searched
-    start: float = 0.0  # Value of a feature to begin with where the plant has none; 0 for what is no feature
-    of_an_experiment: bool = False  # Each experiment has one of its own
-    gross: float = 1.0  # Deviation from which on an estimate is of no use: relative, or in its unit
+    low: float = 0.0  # Lowest value of a search; with low = high the bench's limits
+    high: float = 0.0  # Highest value of a search
+    start: float = 0.0  # Initial value of a feature that the plant lacks; 0 for others
+    of_an_experiment: bool = False  # Each experiment has its own value
+    gross: float = 1.0  # Deviation above which it is not identified: relative, or in its unit
     effect: str = ""  # Noun phrase for a score test; empty where there is none
     remedy: str = ""  # What to do if the score test finds it
     step: float = 0.0  # Of the score test's secant; 0 where the brake has a sensitivity
     positive: bool = False  # It cannot be negative
-    addition: str = ""  # What a model that grows calls it; rows of one name are added together
+    addition: str = ""  # Name in the growth of a model; rows of one name are added together
 
 
 _FREE_IT = "estimate it as well: --params"
@@ -43,7 +43,7 @@ PARAMETERS: Mapping[str, Parameter] = {
     "f_v": Parameter("N·m·s/rad", effect="a change of f_v, which is fixed,", remedy=_FREE_IT),
     "J": Parameter(
         "kg·m²",
-        about="moment of inertia [kg·m²]; scales with all torques, so that one of them has to be known",
+        about="moment of inertia [kg·m²]; scales with all torques, so that one of them has to be given",
         effect="another moment of inertia",
         remedy="correct J in the bench file",
     ),
@@ -86,7 +86,7 @@ PARAMETERS: Mapping[str, Parameter] = {
         False,
         "time by which commands act late [samples], -0.1 to 0.9; below 0, samples are late",
         -0.1,  # samples that are taken late look like commands that act early
-        0.9,  # whole samples are in the record, because the node reports what acted
+        0.9,  # more is in the record: the node reports the currents
         effect="a delay of the commands",
         remedy="--nuisance delay",
         addition="delay of commands",

@@ -53,7 +53,7 @@ class Stage(NamedTuple):
     w: float  # Position of the stop
     i: float  # Current [A]
     force: float  # Clamping force [N]
-    left: float  # Share of the static friction beyond T_c
+    stribeck: float  # Stribeck factor
     per_force: float  # Derivative of the acceleration along the clamping force [rad/s²/N]
     per_angle: float  # Along the angle at constant w [1/s²]
     per_velocity: float  # Along the velocity [1/s]
@@ -82,7 +82,7 @@ def current(m: Mechanics, i: float, u: float, t: float) -> float:
 def current_share(m: Mechanics, i: float, u: float, t: float, before: float, t_s: float, unknown: int) -> float:
     """Sensitivity of that current to an unknown whose sensitivity was ``before`` a time ``t`` ago [A].
 
-    A command that is late by a share of the period ``t_s`` makes the whole current late by as much.
+    A command that is late by a part of the period ``t_s`` delays the current by the same time.
     """
     if m.current_lag == 0.0:
         return 0.0
@@ -104,32 +104,32 @@ def acceleration(m: Mechanics, p: BrakeParameters, a: Slide, t: float, x1: float
     return (p.k_m * current(m, a.i, a.u, t) - p.gamma * force - friction) / p.J
 
 
-def stage(m: Mechanics, p: BrakeParameters, a: Slide, t: float, x1: float, x2: float, left: float) -> Stage:
-    """Acceleration with all that the variational equations need; ``left`` is the decay at this velocity."""
+def stage(m: Mechanics, p: BrakeParameters, a: Slide, t: float, x1: float, x2: float, stribeck: float) -> Stage:
+    """Acceleration and its derivatives for the variational equations; ``stribeck`` is the factor at this velocity."""
     w = a.w + a.rate * (x1 - a.x1)
     i = current(m, a.i, a.u, t)
     speed = x2 * a.direction
     force = clamping_force(m, p, x1, w) * a.loaded
     along, across = clamping_slopes(m, p, x1, w)
-    per_force = -(p.gamma + a.direction * m.f_l * left) / p.J * a.loaded
-    friction = a.direction * sliding_torque(m, p, speed, force, left)
+    per_force = -(p.gamma + a.direction * m.f_l * stribeck) / p.J * a.loaded
+    friction = a.direction * sliding_torque(m, p, speed, force, stribeck)
     return Stage(
         x1,
         speed,
         w,
         i,
         force,
-        left,
+        stribeck,
         per_force,
         per_force * along,
-        -sliding_slope(m, p, speed, force, left) / p.J,
+        -sliding_slope(m, p, speed, force, stribeck) / p.J,
         per_force * across,
         (p.k_m * i - p.gamma * force - friction) / p.J,
     )
 
 
 def forcing(m: Mechanics, p: BrakeParameters, direction: float, at: Stage, i: int, current_change: float) -> float:
-    """θ_i ∂/∂θ_i of the acceleration at constant state, and what the change of the current [A] adds [rad/s²]."""
+    """θ_i ∂/∂θ_i of the acceleration at constant state, with the effect of a change of the current [A] [rad/s²]."""
     if i == K_M:
         return p.k_m * at.i / p.J
     if i == J:
@@ -142,7 +142,7 @@ def forcing(m: Mechanics, p: BrakeParameters, direction: float, at: Stage, i: in
         return p.k_m * current_change / p.J
     if i == CONTACT:
         return -at.per_angle
-    friction = direction * sliding_share(m, p, at.speed, at.force, at.left, i)
+    friction = direction * sliding_share(m, p, at.speed, at.force, at.stribeck, i)
     return at.per_force * clamping_share(m, p, at.x1, at.w, i) - friction / p.J
 
 

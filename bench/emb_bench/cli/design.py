@@ -62,9 +62,9 @@ def _design(args: argparse.Namespace) -> int:
         from emb_bench.design.report import write
 
         write(report, args.output)
-    from emb_bench.report.design import text
+    from emb_bench.report.design import design_text
 
-    print_answer(args, report.metadata, lambda verbose: text(report, str(args.output or ""), verbose=verbose))
+    print_answer(args, report.metadata, lambda verbose: design_text(report, str(args.output or ""), verbose=verbose))
     if report.found.interrupted:
         mention("emb-design: interrupted; this is the best design so far")
         return EXIT_INTERRUPTED

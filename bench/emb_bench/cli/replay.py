@@ -50,18 +50,18 @@ UNKNOWNS = METHODS + "\nThe names of unknowns are in the help of emb-replay esti
 
 
 def _fim(args: argparse.Namespace) -> int:
-    from emb_bench.report import fim
+    from emb_bench.report.fim import fim_document, fim_text
 
     found = cast("Evaluation", api.fisher_information(args.run, given(args, api.FimOptions)))  # of one log
-    print_answer(args, lambda: fim.document(found), lambda verbose: fim.text(found, verbose=verbose))
+    print_answer(args, lambda: fim_document(found), lambda verbose: fim_text(found, verbose=verbose))
     return EXIT_DONE
 
 
 def _estimate(args: argparse.Namespace) -> int:
     study = api.estimate(args.runs, given(args, api.EstimateOptions))
-    from emb_bench.report.estimate import document, text
+    from emb_bench.report.estimate import study_document, study_text
 
-    print_answer(args, lambda: document(study), lambda verbose: text(study, verbose=verbose))
+    print_answer(args, lambda: study_document(study), lambda verbose: study_text(study, verbose=verbose))
     return _exit_code(study, strict=args.strict)
 
 

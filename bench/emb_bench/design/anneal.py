@@ -7,7 +7,7 @@ and the currents follow by dead beat. A worse variation is accepted with a falli
 Vecchi, Science 220, 1983). Variations are judged one by one: the best of several would mostly be one that changes
 nothing. Only the periods from the first change on are simulated again.
 
-Without it, E of the three held-out Euler brakes of docs/figures.md ends at 0.939 to 0.948 of the best known instead of
+Without it, E of the three held-out Euler brakes of docs/figures.md ends at 0.939 to 0.948 of the best found instead of
 0.994 and more, and D at 0.987 to 0.999; more designs that are polished to their ends do not help.
 """
 
@@ -77,7 +77,7 @@ def tracked(problem: Problem, speeds: Floats) -> Tracks:
 
 
 def track(task: Task, number: int, tracks: Tracks) -> None:
-    """Simulate the design of a number, whose speeds are those that are wanted."""
+    """Simulate the design of a number, with target speeds."""
     u, x, s, m = tracks.u[number], tracks.x[number], tracks.s[number], tracks.m[number]
     reach(task, 0, tracks.speeds[number], u, x)
     tracks.price[number] = excess(x, task.box)[0]
@@ -87,10 +87,10 @@ def track(task: Task, number: int, tracks: Tracks) -> None:
 def reach(task: Task, first: int, speeds: Floats, u: Floats, x: Floats) -> None:
     """Find the currents for a design's speeds from a period on, and the states and speeds that they reach, in place.
 
-    Of the box, only the currents' limit is kept for sure.
+    Of the box, only the currents' limit is certain to hold.
     """
     p, most = task.brake, task.box.current
-    nothing, none = task.chosen[:0], task.start[:0]
+    nothing, none = task.unknowns[:0], task.start[:0]
     rate = p.J / (task.t_s * p.k_m)
     for k in range(first, u.shape[0]):
         x1, x2 = x[k, 0], x[k, 1]
@@ -135,14 +135,14 @@ def anneal(task: Task, goal: int, count: int, rng: np.random.Generator, tracks: 
             continue
         s[first], m[first] = tracks.s[at, first], tracks.m[at, first]
         inform(task, first, u, x, s, m)
-        left = 1.0 - number / count
-        softness = max(0.0, 2.0 * left - 1.0) * SOFTNESS
+        temperature = 1.0 - number / count
+        softness = max(0.0, 2.0 * temperature - 1.0) * SOFTNESS
         now = phi(goal, tracks.m[at, n], softness, work) - PRICE * tracks.price[at]
         worth = phi(goal, m[n], softness, work) - PRICE * tracks.price[to]
-        if worth >= now - TEMPERATURE * left * left * rng.exponential():
+        if worth >= now - TEMPERATURE * temperature * temperature * rng.exponential():
             s[:first], m[:first] = tracks.s[at, :first], tracks.m[at, :first]
             at = to
-            if left <= 0.5 and worth > most:
+            if temperature <= 0.5 and worth > most:
                 most = worth
                 best[:] = u
 

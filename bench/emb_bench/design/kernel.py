@@ -50,7 +50,7 @@ class Task(NamedTuple):
     brake: BrakeParameters
     box: Box
     t_s: float  # Period [s]
-    chosen: Integers  # Indices of the unknowns in ``PARAMETERS``, shape (m,)
+    unknowns: Integers  # Indices of the unknowns in ``PARAMETERS``, shape (m,)
     start: Floats  # Their sensitivities at the start, shape (m, SENSITIVE)
     bias: Floats  # What the encoder adds to each sensitivity of the angle, shape (m,)
     w1: float  # Weight of the angle
@@ -75,8 +75,8 @@ def excess(x: Floats, box: Box) -> tuple[float, float]:
 
 
 def inform(task: Task, first: int, u: Floats, x: Floats, s: Floats, m: Floats) -> None:
-    """Sensitivities and information of a motion from a period on; what was before its start is left as it is."""
-    size = task.chosen.shape[0]
+    """Sensitivities and information of a motion from a period on; earlier rows stay unchanged."""
+    size = task.unknowns.shape[0]
     y, trial = np.zeros((size, 2)), np.zeros(STATES)
     for k in range(first, u.shape[0]):
         for i in range(STATES):
@@ -86,7 +86,7 @@ def inform(task: Task, first: int, u: Floats, x: Floats, s: Floats, m: Floats) -
                 s[k + 1, i, j] = s[k, i, j]
         for i in range(m.shape[1]):
             m[k + 1, i] = m[k, i]
-        advance(task.mechanics, task.brake, trial, u[k], task.t_s, task.chosen, s[k + 1])
+        advance(task.mechanics, task.brake, trial, u[k], task.t_s, task.unknowns, s[k + 1])
         for i in range(size):
             y[i, 0], y[i, 1] = s[k + 1, i, 0] + task.bias[i], s[k + 1, i, 1]
         add_increment(m[k + 1], y, task.w1, task.w2)
@@ -98,7 +98,7 @@ def linearise(task: Task, u: Floats, x: Floats, s: Floats, jacobian: Floats) -> 
     The map is linear in the sensitivities, and each row of them moves as the brake's state does: their derivatives are
     differences over a unit step, of one row for all.
     """
-    m = task.chosen.shape[0]
+    m = task.unknowns.shape[0]
     size = STATES + SENSITIVE * m
     work_x, work_s = np.empty((2, STATES)), np.empty((2, m, SENSITIVE))
     jacobian[:] = 0.0
@@ -116,7 +116,7 @@ def linearise(task: Task, u: Floats, x: Floats, s: Floats, jacobian: Floats) -> 
                 elif not of_current:
                     work_s[side, 0, column - STATES] += shift
                 current = u[k] + shift if of_current else u[k]
-                advance(task.mechanics, task.brake, work_x[side], current, task.t_s, task.chosen, work_s[side])
+                advance(task.mechanics, task.brake, work_x[side], current, task.t_s, task.unknowns, work_s[side])
             if of_state or of_current:
                 to = column if of_state else size
                 for row in range(STATES):
@@ -180,31 +180,32 @@ def explore(task: Task, genes: Floats, u: Floats, m: Floats, price: Floats) -> N
     Results: currents ``u``, shape (count, n), packed FIM ``m`` and the price of :func:`excess`, one for each design.
     """
     p, box, t_s, n = task.brake, task.box, task.t_s, u.shape[1]
-    journeys, nothing, none = genes.shape[1] // 3, task.chosen[:0], task.start[:0]
-    x, s = np.zeros((n + 1, STATES)), np.zeros((n + 1, task.chosen.shape[0], SENSITIVE))
+    journeys, nothing, none = genes.shape[1] // 3, task.unknowns[:0], task.start[:0]
+    x, s = np.zeros((n + 1, STATES)), np.zeros((n + 1, task.unknowns.shape[0], SENSITIVE))
     total = np.zeros((n + 1, m.shape[1]))
     s[0] = task.start
     for e in range(genes.shape[0]):
-        whole = 0.0
+        duration = 0.0
         for g in range(journeys):
-            whole += genes[e, 2 * journeys + g]
+            duration += genes[e, 2 * journeys + g]
         journey, end, toward = -1, 0.0, 0.0
         target, speed = 0.0, 0.0
         for k in range(n):
             while k >= end and journey < journeys - 1:
                 journey += 1
-                end += genes[e, 2 * journeys + journey] / whole * n
+                end += genes[e, 2 * journeys + journey] / duration * n
                 angle, creep = genes[e, journey], genes[e, journeys + journey]
                 target = angle * angle * angle * (box.high if angle > 0.0 else -box.low)
                 speed = creep * creep * creep * box.speed
                 toward = 1.0 if target > x[k, 0] else -1.0
-            left = target - x[k, 0] - t_s * x[k, 1]  # after this period, which its current does not change much
-            if toward * (target - x[k, 0]) <= 0.0 or abs(left) < ARRIVED:
+            distance = target - x[k, 0] - t_s * x[k, 1]  # after this period, which its current does not change much
+            if toward * (target - x[k, 0]) <= 0.0 or abs(distance) < ARRIVED:
                 toward = 0.0
-            wanted = speed
+            goal = speed
             if toward != 0.0:
-                wanted = sign(left) * min(allowed(abs(left), deceleration(p, box), t_s), abs(left) / t_s, box.speed)
-            u[e, k] = follow(p, box, t_s, x[k, 0], x[k, 1], wanted, n - k)
+                fastest = allowed(abs(distance), deceleration(p, box), t_s)
+                goal = sign(distance) * min(fastest, abs(distance) / t_s, box.speed)
+            u[e, k] = follow(p, box, t_s, x[k, 0], x[k, 1], goal, n - k)
             for i in range(STATES):
                 x[k + 1, i] = x[k, i]
             advance(task.mechanics, p, x[k + 1], u[e, k], t_s, nothing, none)
@@ -218,19 +219,19 @@ def deceleration(p: BrakeParameters, box: Box) -> float:
     return 0.9 * max(motor + p.T_c - p.gamma * p.k_1 * box.high * 0.5, 0.1 * motor) / p.J
 
 
-def follow(p: BrakeParameters, box: Box, t_s: float, x1: float, x2: float, wanted: float, left: int) -> float:
-    """Current that brings the speed to ``wanted`` in one period, unless a limit or the way home forbids [A].
+def follow(p: BrakeParameters, box: Box, t_s: float, x1: float, x2: float, goal: float, periods: int) -> float:
+    """Current that brings the speed to ``goal`` in one period, unless a limit or the way home forbids [A].
 
-    There are ``left`` periods to the end of the experiment.
+    ``periods`` remain to the end of the experiment.
     """
     spring = p.gamma * p.k_1 * max(x1, 0.0)
     braking = deceleration(p, box)
-    if math.isfinite(box.home_angle) and left * t_s <= way_home(x1, x2, braking, box.speed) + ARRIVAL * t_s:
-        wanted = -sign(x1) * allowed(abs(x1), braking, t_s)
+    if math.isfinite(box.home_angle) and periods * t_s <= way_home(x1, x2, braking, box.speed) + ARRIVAL * t_s:
+        goal = -sign(x1) * allowed(abs(x1), braking, t_s)
     ahead = x1 + t_s * x2
     fastest = min(allowed(box.high - ahead, braking, t_s), box.speed)
     slowest = -min(allowed(ahead - box.low, braking, t_s), box.speed)
-    target = min(max(wanted, slowest), fastest)
+    target = min(max(goal, slowest), fastest)
     rubbing = x2 if abs(x2) > p.T_c * t_s / p.J else target
     torque = p.J * (target - x2) / t_s + spring + p.T_c * sign(rubbing) + p.f_v * x2
     return min(max(torque / p.k_m, -box.current), box.current)

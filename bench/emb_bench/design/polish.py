@@ -2,7 +2,7 @@
 
 At a design, the motion and the Fisher information are linear functions of a change of the currents, to first order: the
 maps of the single periods are differentiated, and an adjoint sweep gives every element of M. The criterion is concave
-in M, so that its tangents at a few matrices bound it from above (Kelley's cutting planes). What is left is a sparse
+in M, so that its tangents at a few matrices bound it from above (Kelley's cutting planes). The result is a sparse
 linear program over changes of currents and states within the limits, which HiGHS solves. A step counts if the simulated
 criterion grows. Optima of this problem lie on corners: currents at their limits, speeds at theirs, the end at the edge
 of home. That is where a linear program goes (Fletcher and Sainz de la Maza, Mathematical Programming 43, 1989).
@@ -82,8 +82,8 @@ class _Step:
         jacobian = problem.jacobian(design)
         self.slopes = problem.gradients(design, jacobian)
         # Position in hysteresis or play and the motor's current move the brake only where a plant has them.
-        self.kept = 4 if jacobian[:, :2, 2:4].any() else 2
-        self.motion = _motion(jacobian[:, : self.kept, : self.kept], jacobian[:, : self.kept, -1])
+        self.states = 4 if jacobian[:, :2, 2:4].any() else 2
+        self.motion = _motion(jacobian[:, : self.states, : self.states], jacobian[:, : self.states, -1])
         self.cuts = [design.matrix]
 
     def solve(self, radius: float, cuts: int) -> tuple[Floats, float]:
@@ -108,7 +108,7 @@ class _Step:
 
     def _program(self, radius: float) -> tuple[Floats, float, float]:
         """Solve the linear program: change of the currents, least tangent there, share of the price that stays."""
-        n, kept = len(self.design.currents), self.kept
+        n, states = len(self.design.currents), self.states
         rows, right = [], []
         for matrix in self.cuts:  # t <= phi(matrix) + <gradient, M + dM - matrix> - phi
             slope = self.problem.criterion.gradient(matrix)
@@ -116,10 +116,10 @@ class _Step:
             ahead = float(self.problem.criterion.phi(matrix)) - self.design.phi
             right.append(ahead + float((slope * (self.design.matrix - matrix)).sum()))
         scale = max(float(np.abs(rows[0]).max()), 1e-12)
-        cuts = np.zeros((len(rows), n + kept * n + 1))
+        cuts = np.zeros((len(rows), n + states * n + 1))
         cuts[:, :n] = np.array(rows) / scale
         cuts[:, -1] = 1.0
-        cost = np.zeros(n + kept * n + 1)
+        cost = np.zeros(n + states * n + 1)
         cost[-1] = -1.0
         if not (np.isfinite(cuts).all() and np.isfinite(right).all()):
             return np.zeros(n), 0.0, 1.0  # nothing to go by: the information is singular here, or has overflowed
@@ -129,7 +129,7 @@ class _Step:
                 A_ub=csr_array(cuts),
                 b_ub=np.array(right) / scale,
                 A_eq=self.motion,
-                b_eq=np.zeros(kept * n),
+                b_eq=np.zeros(states * n),
                 bounds=self._bounds(radius, slack),
                 method="highs-ds",
                 options={"primal_feasibility_tolerance": 1e-9, "dual_feasibility_tolerance": 1e-9},
@@ -139,10 +139,10 @@ class _Step:
         return np.zeros(n), 0.0, 1.0
 
     def _bounds(self, radius: float, slack: float) -> Floats:
-        """Lowest and highest change of each variable, shape (n + kept n + 1, 2)."""
+        """Lowest and highest change of each variable, shape (n + states n + 1, 2)."""
         box, u, x = self.problem.box, self.design.currents, self.design.states[1:]
         exact = self.problem.plant.mechanics.solver == EXACT
-        lowest, highest = np.full((len(u), self.kept), -np.inf), np.full((len(u), self.kept), np.inf)
+        lowest, highest = np.full((len(u), self.states), -np.inf), np.full((len(u), self.states), np.inf)
         lowest[:, 0], highest[:, 0] = box.low, box.high
         lowest[:, 1], highest[:, 1] = -box.speed, box.speed
         slowest = np.minimum(np.abs(x[:, 1]), SLOWEST if exact else SLOWEST_STEPPED)
@@ -155,7 +155,7 @@ class _Step:
         end = np.array([box.home_angle, box.home_velocity])
         lowest[-1, :2] = np.maximum(lowest[-1, :2], -end)
         highest[-1, :2] = np.minimum(highest[-1, :2], end)
-        below, above = lowest - x[:, : self.kept], highest - x[:, : self.kept]
+        below, above = lowest - x[:, : self.states], highest - x[:, : self.states]
         below = np.where(below > 0.0, (1.0 - slack) * below, below)
         above = np.where(above < 0.0, (1.0 - slack) * above, above)
         low = np.concatenate([np.maximum(-radius, -box.current - u), below.ravel(), [-np.inf]])

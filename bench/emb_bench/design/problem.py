@@ -20,7 +20,7 @@ from emb_bench.information.criteria import Criterion
 from emb_bench.information.evaluation import Question
 from emb_bench.information.fisher import Kind, Weights, weights_along
 from emb_bench.information.symmetric import packed_size, unpack
-from emb_bench.sim.open_loop import check_unknowns, held, march, trajectory
+from emb_bench.sim.open_loop import check_unknowns, march, trajectory, zero_order_hold
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import EmbError, UsageError
 
@@ -46,9 +46,9 @@ class Problem:
     @cached_property
     def task(self) -> Task:
         """The problem for compiled loops."""
-        chosen, start = no_sensitivity(self.params)
-        bias = (chosen == OFFSET).astype(np.float64)
-        return Task(self.plant.mechanics, self.brake, self.box, self.sample_time, chosen, start, bias, *self.weights)
+        unknowns, start = no_sensitivity(self.params)
+        bias = (unknowns == OFFSET).astype(np.float64)
+        return Task(self.plant.mechanics, self.brake, self.box, self.sample_time, unknowns, start, bias, *self.weights)
 
     @property
     def criterion(self) -> Criterion:
@@ -76,12 +76,12 @@ class Problem:
     def design(self, currents: Floats) -> Design:
         """Simulate a sequence of currents [A], one per sample, shape (n,)."""
         task = self.task
-        acting = held(currents, self.sample_time)
-        x, s = trajectory(compiled(march), task.mechanics, task.brake, acting, task.chosen, rest(), task.start)
+        acting = zero_order_hold(currents, self.sample_time)
+        x, s = trajectory(compiled(march), task.mechanics, task.brake, acting, task.unknowns, rest(), task.start)
         y = s[1:, :, :2].copy()
         y[:, :, 0] += task.bias
         root = np.sqrt(self.weights)
-        scaled = (y * root).transpose(1, 0, 2).reshape(len(task.chosen), -1)
+        scaled = (y * root).transpose(1, 0, 2).reshape(len(task.unknowns), -1)
         price, worst = compiled(kernel.excess)(x, self.box)
         matrix = scaled @ scaled.T
         return Design(currents, x, s, matrix, self.phi(currents, matrix), price, worst)

@@ -31,7 +31,7 @@ from emb_runtime.system.terminal import json_document
 
 COLUMNS = ("time", "current", "angle", "velocity")
 MAX_DESIGN_BYTES = 64 << 20  # Of a design's file
-CHECKED = ("euler", "exact")  # Brakes on which every design is computed once more, besides its own
+CHECKED = ("euler", "exact")  # Brakes on which every design is simulated again, besides that of its problem
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Check:
     """A design on one brake, in plain Python from the brake's equations."""
 
     plant: str
-    value: float  # The criterion, in its own unit
+    value: float  # The criterion, in its unit
     log_det: float
     lambda_min: float
     trace_inverse: float
@@ -98,7 +98,7 @@ class Report:
     starts: int
     version: str
     found: Found
-    checks: tuple[Check, ...]  # Its own brake first
+    checks: tuple[Check, ...]  # On the brake of its problem first
 
     @property
     def criterion(self) -> Criterion | IntervalCriterion:
@@ -168,7 +168,7 @@ def make_report(
     seed: int,
     told: Callable[[str], object] = str,
 ) -> Report:
-    """Search for a design, and simulate it again on its own brake and on ``CHECKED``."""
+    """Search for a design, and simulate it again on the brake of its problem and on ``CHECKED``."""
     found = search(problem, starts=starts, seed=seed, told=told)
     plants = dict.fromkeys((problem.plant.name, *CHECKED))
     return Report(

@@ -52,11 +52,11 @@ PATIENCE = 4  # Rounds over which the gain is judged
 GAIN = 3e-4  # Gain of φ over these rounds below which the search ends
 SOFT = 0.05  # Share of the price of leaving the box that a coarse design pays: the polish brings it back in
 FIRM = 20.0  # The same where no polish follows
-WORST = -1e3  # Worth of a table that says nothing
+WORST = -1e3  # Worth of a table without information
 LONG = Settings(steps=80, tolerance=5e-5, cuts=4)  # Polish of every design at first, and of the best one at the end
 AGAIN = Settings(steps=6, tolerance=0.0, cuts=2)  # Polish after each annealing
 SHORT = Settings(steps=20, tolerance=1e-3, cuts=1)  # Polish of a finished design inside tighter limits
-REPAIRS = 3  # Most times that limits are tightened because a brake left them between samples
+REPAIRS = 3  # Most times that limits are tightened because a brake exceeded them between samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,11 +116,11 @@ def search(
             lines = sorted(pool.map(lambda d: _better(d, polish(problem, d.currents, LONG)), begun), key=_rank)[::-1]
             told("the best starts polished")
             while not _settled(history):
-                kept = max(1, LINES - len(history))
-                ended += lines[kept:]
-                lines = lines[:kept]
-                varied = pool.map(lambda d, rng: _varied(problem, d, rng), lines if kept > 1 else lines * LAST, draws)
-                lines = sorted(varied, key=_rank, reverse=True)[:kept]
+                count = max(1, LINES - len(history))
+                ended += lines[count:]
+                lines = lines[:count]
+                varied = pool.map(lambda d, rng: _varied(problem, d, rng), lines if count > 1 else lines * LAST, draws)
+                lines = sorted(varied, key=_rank, reverse=True)[:count]
                 history.append(_rank(lines[0]))
                 told(f"round {len(history)} of at most {ROUNDS} of improvement done")
             interrupted = False
@@ -213,7 +213,7 @@ def _better(a: Design, b: Design) -> Design:
 
 
 def _between_samples(problem: Problem, design: Design) -> Design | None:
-    """The design again, inside limits drawn tighter by what it left them by between samples; None if that fails."""
+    """The design again, inside limits that are tighter by its excess between samples; None if that fails."""
     angle, speed = 0.0, 0.0
     for _ in range(REPAIRS):
         beyond = problem.beyond(design)
@@ -254,16 +254,16 @@ def evolved(
         "tolfun": 1e-5,
         "tolflatfitness": 20,
         "randn": lambda *shape: rng.standard_normal(shape),
-        "seed": np.nan,  # the library's own numbers are not used
+        "seed": np.nan,  # random numbers are handed in
         "verbose": -9,
     }
     strategy = cma.CMAEvolutionStrategy(begin, spread, options)
     best, least = begin, float(_cost(problem, begin[None], far)[0])
     while not strategy.stop():
-        asked = strategy.ask()
-        genes = np.array(asked)
+        candidates = strategy.ask()
+        genes = np.array(candidates)
         cost = _cost(problem, genes, far)
-        strategy.tell(asked, cost.tolist())
+        strategy.tell(candidates, cost.tolist())
         top = int(np.argmin(cost))
         if cost[top] < least:
             best, least = genes[top], float(cost[top])

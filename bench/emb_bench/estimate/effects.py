@@ -57,7 +57,7 @@ LAGGING = "velocity_lag"  # Explains a misfit if an observer is found in the vel
 class Prediction(Protocol):
     """Predicted samples of each experiment at an estimate, in standard deviations of the residuals."""
 
-    def columns(self, experiment: int, names: tuple[str, ...]) -> Floats:
+    def derivatives(self, experiment: int, names: tuple[str, ...]) -> Floats:
         """Derivatives to further unknowns, shape (n, names, 2)."""
 
     def parts(self, experiment: int, unknowns: Integers, shares: Floats) -> Floats:
@@ -92,9 +92,9 @@ class Simulation:
         found = self.trajectories or [self.problem.motion(self.z, i) for i in range(len(self.problem.experiments))]
         return [one.samples for one in found]
 
-    def columns(self, experiment: int, names: tuple[str, ...]) -> Floats:
+    def derivatives(self, experiment: int, names: tuple[str, ...]) -> Floats:
         """As :class:`Prediction`."""
-        first, computed = len(self.problem.columns(experiment)), self.trajectories
+        first, computed = len(self.problem.indices(experiment)), self.trajectories
         is_computed = computed is not None and names == self.besides
         at = computed[experiment] if computed and is_computed else self.problem.predict(self.z, experiment, names)
         return at.sensitivities[:, first : first + len(names)] * self.weights[experiment][:, None]
@@ -129,7 +129,7 @@ class Path(NamedTuple):
     velocities: Floats  # At the same, shape (n + 1,) [rad/s]
 
 
-def columns(
+def regressors(
     problem: Problem, z: Floats, prediction: Prediction, jacobian: Floats, names: tuple[str, ...]
 ) -> dict[str, Floats]:
     """Regressor of each effect that the model lacks, of those named: whitened samples per unit of the effect, by name.
@@ -247,7 +247,7 @@ class Linearised:
             n: -self.jacobian[:, unknowns.index(n)].reshape(-1, 2) for n in ("k_m", "f_v", "J") if n in unknowns
         }
         if names:
-            found |= zip(names, self.prediction.columns(self.experiment, names).transpose(1, 0, 2), strict=True)
+            found |= zip(names, self.prediction.derivatives(self.experiment, names).transpose(1, 0, 2), strict=True)
         return found
 
     @cached_property

@@ -24,7 +24,7 @@ from emb_bench.brake.motion import Floats
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Plant
 from emb_bench.estimate.average import average
-from emb_bench.estimate.effects import Simulation, columns, lacked_sensitivities, with_systematic
+from emb_bench.estimate.effects import Simulation, lacked_sensitivities, regressors, with_systematic
 from emb_bench.estimate.estimate import OF_THE_BENCH
 from emb_bench.estimate.intervals import largest, unnoticed
 from emb_bench.estimate.prediction import Problem, make_problem
@@ -162,7 +162,7 @@ def of_problem(problem: Problem, z: Floats) -> Interval:
     if any(experiment.gap_unknowns for experiment in problem.experiments):
         basis = np.concatenate([basis, problem.gap_basis(z, weights)], axis=1)
     prediction = Simulation(problem, z, weights, trajectories, fixed)
-    found = lacking(columns(problem, z, prediction, jacobian, effects), basis, inverse)
+    found = lacking(regressors(problem, z, prediction, jacobian, effects), basis, inverse)
     information = np.sum(found.beside**2, axis=1)
     budget = budget_of(problem, averaged, found, information, np.sqrt(information))
     covariance = Spectrum(jacobian.T @ jacobian + averaged.added()).inverse()

@@ -160,7 +160,7 @@ class FilterPrediction:
     weights: Sequence[Floats]
     gains: Sequence[Floats]
 
-    def columns(self, experiment: int, names: tuple[str, ...]) -> Floats:
+    def derivatives(self, experiment: int, names: tuple[str, ...]) -> Floats:
         """As :class:`~emb_bench.estimate.effects.Prediction`."""
         return self._followed(experiment, besides=names)[1][:, -len(names) :]
 

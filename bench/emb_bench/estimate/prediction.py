@@ -157,13 +157,13 @@ class Problem:
         unknowns = [Unknown(u.name, None if u.experiment is None else index[u.experiment]) for u in problem.unknowns]
         return problem, [self.unknowns.index(unknown) for unknown in unknowns]
 
-    def columns(self, experiment: int) -> list[int]:
+    def indices(self, experiment: int) -> list[int]:
         """Indices of the elements of z that an experiment depends on."""
         return [i for i, u in enumerate(self.unknowns) if u.experiment in (None, experiment)]
 
     def at(self, z: Floats, experiment: int) -> Theta:
         """Parameters, start and systematic errors of an experiment at ``z``."""
-        values = {self.unknowns[i].name: float(z[i]) for i in self.columns(experiment)}
+        values = {self.unknowns[i].name: float(z[i]) for i in self.indices(experiment)}
         offset = values.get("offset", self.plant.instruments.encoder_offset)
         x1, x2 = self.experiments[experiment].start(offset)
         if "offset" in values:
@@ -175,8 +175,8 @@ class Problem:
         return Theta(self.theta(z), start, errors, values.get("contact", 0.0))
 
     def names(self, experiment: int) -> tuple[str, ...]:
-        """The unknowns that an experiment depends on, in the order of ``columns``."""
-        return tuple(self.unknowns[i].name for i in self.columns(experiment))
+        """The unknowns that an experiment depends on, in the order of ``indices``."""
+        return tuple(self.unknowns[i].name for i in self.indices(experiment))
 
     def predict(self, z: Floats, experiment: int, besides: tuple[str, ...] = ()) -> Trajectory:
         """Predicts an experiment, with sensitivities to its unknowns, those ``besides``, and those of its gaps."""
@@ -245,7 +245,7 @@ class Problem:
         for i, (experiment, root) in enumerate(zip(self.experiments, weights, strict=True)):
             at = self.predict(z, i) if trajectories is None else trajectories[i]
             rows = at.sensitivities * root[:, None]
-            parts.append((np.nan_to_num(experiment.samples - at.samples) * root, rows[:, : len(self.columns(i))]))
+            parts.append((np.nan_to_num(experiment.samples - at.samples) * root, rows[:, : len(self.indices(i))]))
             in_gaps = rows[:, rows.shape[1] - experiment.gap_unknowns :]
             columns.append(in_gaps.transpose(0, 2, 1).reshape(root.size, -1))
         residuals, rows = self.stacked(z, parts)
@@ -295,11 +295,11 @@ class Problem:
         """All residuals in one row, and their derivatives to z, as :meth:`jacobian`.
 
         ``parts`` has for each experiment the whitened errors of its samples, shape (n, 2), and the derivatives of the
-        prediction to the experiment's unknowns in the same unit, shape (n, columns, 2).
+        prediction to the experiment's unknowns in the same unit, shape (n, indices, 2).
         """
         residuals, rows = [], []
         for i, (errors, shares) in enumerate(parts):
-            columns = self.columns(i)
+            columns = self.indices(i)
             block = np.zeros((*errors.shape, len(z)))
             block[:, :, columns] = -shares.transpose(0, 2, 1)
             residuals.append(errors.ravel())
@@ -311,7 +311,7 @@ class Problem:
         """Numbers of the experiments whose angle at rest is a measurement, and the elements of z that it depends on."""
         found = {}
         for i, experiment in enumerate(self.experiments):
-            touched = [c for c in self.columns(i) if self.unknowns[c].name in ("x1_0", "offset")]
+            touched = [c for c in self.indices(i) if self.unknowns[c].name in ("x1_0", "offset")]
             if touched and experiment.slack > 0.0:
                 found[i] = touched
         return found

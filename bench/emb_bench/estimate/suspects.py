@@ -23,7 +23,7 @@ from emb_bench.brake.parameters import CURVED, PARAMETERS
 from emb_bench.config.machine import Machine
 from emb_bench.estimate.average import SHARES, Average, Influence, average, unaveraged
 from emb_bench.estimate.derived_velocity import derived
-from emb_bench.estimate.effects import DRIFTS, EFFECTS, LAGGING, Prediction, columns, possible
+from emb_bench.estimate.effects import DRIFTS, EFFECTS, LAGGING, Prediction, possible, regressors
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Cause, Contribution, JointScore, ModelValidation, Suspect
 from emb_runtime.config.bench import PARAMETER_NAMES
@@ -78,7 +78,7 @@ def score(
     """
     errors, jacobian = linearised
     names = tuple(name for name, row in EFFECTS.items() if row.tested or name in problem.question.unmodelled)
-    found = lacking(columns(problem, z, prediction, jacobian, names), basis, basis_and_inverse(jacobian)[1])
+    found = lacking(regressors(problem, z, prediction, jacobian, names), basis, basis_and_inverse(jacobian)[1])
     scores = np.array([row @ errors for row in found.beside])
     squares = np.array([np.linalg.norm(row) ** 2 for row in found.beside])
     budget = budget_of(

@@ -1,4 +1,4 @@
-"""One experiment as arrays: the current that acted in each sampling period, and what was measured at its end."""
+"""One experiment as arrays: the applied current in each sampling period, and the sample at its end."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from emb_bench.config.plants import Plant
 from emb_runtime.errors import UsageError
 
 REST_SIGMAS = 4.0
-"""A mean that lies this near to zero, in its own standard deviations, is taken as zero: the origin, at rest."""
+"""Distance below which a mean counts as zero, in its standard deviations: rest at the origin."""
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -22,19 +22,19 @@ Booleans = NDArray[np.bool_]
 
 
 class Lack(Enum):
-    """Part of an experiment that is missing, or not to be trusted, with the numbers that belong to it."""
+    """Missing or uncertain part of an experiment; the comments name its numbers."""
 
     ENDS_EARLY = auto()  # Periods, and those that the run had to have
-    LOST = auto()  # Samples; what acted before them was not reported
-    LOST_WITH_CHARGE = auto()  # Samples, and periods of which the charge says what acted
-    CONTRADICTED = auto()  # Periods whose report names another current than the command
+    LOST = auto()  # Samples; the currents before them were not reported
+    LOST_WITH_CHARGE = auto()  # Samples, and periods whose current follows from the charge
+    CONTRADICTED = auto()  # Periods with another current in the report than in the command
     NO_COUNTERS = auto()
     NO_VELOCITY = auto()  # Bandwidth of the observer in its place [rad/s]
     NO_CURRENT = auto()
     NO_COMMANDS = auto()
     NO_TIMES = auto()
     LOST_OF_RECORDING = auto()  # Samples
-    HEAD = auto()  # Line of a file that was taken for its head
+    HEAD = auto()  # Line of the head in a file
     OTHER_FRAMES = auto()  # CAN frames that were skipped, and their identifiers
     BAD_FRAMES = auto()  # CAN frames that do not fit the DBC
 
@@ -44,13 +44,13 @@ class Quality:
     """Facts about an experiment besides its samples, by its log."""
 
     planned: int = 0  # Periods that the run was to have
-    braked: int = 0  # Periods that the node braked by itself because no command came in time
+    braked: int = 0  # Periods that the node braked, because no command came in time
     command_delay: int = 0  # Samples by which commands acted late, by the node's reports
     lacks: Mapping[Lack, tuple[float, ...]] = field(default_factory=dict)  # With the numbers that belong to each
-    faults: tuple[str, ...] = ()  # What of its map a recording of others contradicts, in words
+    faults: tuple[str, ...] = ()  # Contradictions of a recording to its map, in words
     within: float | None = None
-    """Of a mapped drive: difference between command and report up to which the command acted [A], NaN if its mapping is
-    not readable, so that reports alone count; None of other nodes."""
+    """Of a mapped drive: largest difference of command and report at which the command counts [A]; NaN if its mapping
+    is not readable, so that reports alone count; None of other nodes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,22 +58,22 @@ class Experiment:
     """An experiment of n sampling periods; period k lies between the samples k and k + 1, k = 0, ..., n - 1."""
 
     name: str
-    currents: Floats  # Current that acted in each period, known or assumed [A], shape (n,)
+    currents: Floats  # Applied current in each period, reported or assumed [A], shape (n,)
     samples: Floats  # Samples 1 to n: angle [rad], velocity [rad/s], NaN where lost, shape (n, 2)
     angle: float  # Angle measured before the experiment [rad]
     velocity: float  # Velocity measured before the experiment [rad/s]; 0 if the brake rested
-    slack: float  # Standard deviation of ``angle``; 0 if it is not known [rad]
+    slack: float  # Standard deviation of ``angle`` [rad]; 0 if unavailable
     from_origin: bool  # True if the start cannot be distinguished from rest at the origin
     late: Floats | None = None
-    """Lateness of each sample after the grid, by the node's own stamps [s], shape (n,); None without stamps."""
+    """Lateness of each sample after the grid, by the node's stamps [s], shape (n,); None without stamps."""
     assumed: Floats | None = None
-    """Assumed current of the periods of which no report says what acted, NaN for the others [A], shape (n,); None
-    without such gaps. ``currents`` holds it too, or what an estimate has made of it."""
+    """Assumed current of periods without report, NaN for the others [A], shape (n,); None without such gaps.
+    ``currents`` has it as well, or the value of an estimate."""
     places: Floats | None = None
-    """True angle [rad] and velocity [rad/s] after each gap of several periods, as an estimate has found them, shape
-    (gaps, 2); None before."""
+    """True angle [rad] and velocity [rad/s] after each gap of several periods by an estimate, shape (gaps, 2); None
+    before one."""
     before: float = 0.0  # Current that acted before the first period [A]
-    outliers: int = 0  # Samples that were left out because they lie apart from their neighbours
+    outliers: int = 0  # Samples removed as outliers
     first: tuple[float, float] = (np.nan, np.nan)  # Sample 0: angle [rad], velocity [rad/s]; NaN where it was lost
     quality: Quality = Quality()
 
@@ -94,12 +94,12 @@ class Experiment:
 
     @property
     def reported(self) -> Booleans:
-        """True for each period of which it is known what acted, shape (n,)."""
+        """True for each period with a reported current, shape (n,)."""
         return np.ones(self.periods, np.bool_) if self.assumed is None else np.isnan(self.assumed)
 
     @cached_property
     def gaps(self) -> tuple[Integers, Integers]:
-        """Periods of which it is not known what acted: single ones, and the last ones of several in a row."""
+        """Periods without a reported current: single ones, and the last ones of several in a row."""
         lost = np.zeros(self.periods + 2, np.bool_)
         lost[1:-1] = ~self.reported
         ends = lost[1:-1] & ~lost[2:]
@@ -123,7 +123,7 @@ class Experiment:
         return (0.0 if abs(angle) <= REST_SIGMAS * self.slack else angle), self.velocity
 
     def seen_by(self, plant: Plant) -> Experiment:
-        """The experiment of a plant whose encoder's offset says whether the start may be rest at the origin."""
+        """The experiment for a plant, whose encoder offset decides if the start may be rest at the origin."""
         return replace(self, from_origin=self.x0(plant.instruments.encoder_offset) == (0.0, 0.0))
 
     def start(self, offset: float) -> tuple[float, float]:
@@ -131,7 +131,7 @@ class Experiment:
         return (0.0 if self.from_origin else self.angle - offset), self.velocity
 
     def lose(self, mask: Booleans) -> Experiment:
-        """The experiment without the samples of a mask, shape (n,), as outliers; what acted stays known."""
+        """The experiment without the samples of a mask, shape (n,), as outliers; the currents stay."""
         samples = np.where(mask[:, None], np.nan, self.samples)
         return replace(self, samples=samples, outliers=self.outliers + int(mask.sum()))
 
@@ -142,7 +142,7 @@ class Experiment:
         return cut if self.places is None else replace(cut, places=self.places[: len(cut.gaps[1])])
 
     def from_state(self, angle: float, velocity: float) -> Experiment:
-        """The experiment with another state at sample 0 [rad, rad/s]: nothing known of the old one holds there."""
+        """The experiment with another state at sample 0 [rad, rad/s], without all that belongs to the old one."""
         return replace(self, angle=angle, velocity=velocity, slack=0.0, from_origin=False, places=None)
 
     def part(self, begin: int, end: int) -> Experiment:

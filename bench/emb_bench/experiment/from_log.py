@@ -1,11 +1,11 @@
-"""The experiment inside a log: which current acted in which period, and what was measured at its end.
+"""The experiment in a log: the applied current of each period, and the sample at its end.
 
-The node's own time stamps say which period is which. What acted is what the node reports at the period's end, which is
-exact, also where commands act late: it obeys and reports currents in the steps of the CAN signal. A mapped drive
-reports coarsely what acted: there it is the command as its bus carried it, where the report agrees.
+The node's time stamps give the number of a period. The applied current is the one that the node reports at the period's
+end. The report is exact, also if commands act late: the node obeys and reports currents in the steps of the CAN signal.
+A mapped drive reports coarsely: there the applied current is the command on its bus, if the report agrees.
 
-``/cycle`` has one record for each sample that the loop had in control: what was measured, what was sent for it. Two
-things come from the node's messages: the command that it reports as obeyed, and the samples before the experiment.
+``/cycle`` has one record for each sample in control, with the sample and the command sent. Two things come from the
+node's messages: the counter of the obeyed command, and the samples before the experiment.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ REST_SAMPLES = 50  # Most samples before the experiment from which the position 
 
 SPARSEST = 1000  # Most periods for each control cycle in a log; a log that claims more contradicts itself
 LONGEST = 10_000_000  # Most periods of an experiment: it is taken into memory
-UNKNOWN = -1  # Counter of a command that is not known
+UNKNOWN = -1  # Counter of a missing command
 
 _MEASURED = {"angle": "Angle", "velocity": "Velocity", "applied_current": "AppliedCurrent"}
 """Columns that come from signals of the node's messages."""
@@ -57,7 +57,7 @@ def read_experiment(log: RunLog, bench: Bench | None = None, name: str = "") -> 
     """The experiment in a log; ``bench`` is used where the log carries no bench file.
 
     Raises:
-        LogError: the log has no experiment, or none of which a whole period is left, or contradicts itself.
+        LogError: the log has no experiment, not one complete period of it, or contradicts itself.
     """
     if isinstance(log, Recording):
         found = log.experiment
@@ -80,7 +80,7 @@ def _read(log: RunLog, bench: Bench) -> Experiment:
     counted = received[1:]
     by_charge = currents_by_charge(samples, bench, log.layout)
     wrong, squares = zip(*(_disagreements(log, bench, samples, delay, within) for delay in _DELAYS), strict=True)
-    # A mapped drive does not say which command it obeys.
+    # A mapped drive does not report the obeyed command.
     delay = int(np.argmin(wrong if log.drive_files is None else squares))
     periods, lost = len(counted), int((~counted).sum())
     currents = _acted(log, bench, samples, by_charge, delay, within)
@@ -114,7 +114,7 @@ def _planned(log: RunLog, bench: Bench) -> int:
 
 
 def _due(log: RunLog, count: int, planned: int) -> int:
-    """Periods that the run had to have: all that it had, where it was over because enough was known."""
+    """Periods that the run had to have: all that it had, if it reached its stop condition."""
     over = {"exit_reason": "DONE", "goal_reached": "True"}
     return count if over.items() <= log.end.items() else planned
 
@@ -131,8 +131,8 @@ def _commanded(log: RunLog, samples: Samples, delay: int) -> Floats:
 def _disagreements(log: RunLog, bench: Bench, samples: Samples, delay: int, within: float) -> tuple[int, float]:
     """Periods whose report names another command than the one sent for them, or another current than the one to act.
 
-    The one to act is that of the command of ``delay`` samples before; of a mapped drive a difference ``within`` some
-    steps is none [A]. What the node does where no command came in time is its own affair.
+    The current to act is that of the command ``delay`` samples before; with a mapped drive differences up to ``within``
+    do not count [A]. Periods without a command in time are not compared.
 
     Returns:
         Their number, and the mean square of the differences of the currents [A²].
@@ -140,7 +140,7 @@ def _disagreements(log: RunLog, bench: Bench, samples: Samples, delay: int, with
     counted, obeyed = samples.received[1:], samples.obeyed[1:]
     errors = _commanded(log, samples, delay) - samples.applied[1:]
     named = samples.answer[:-1] == obeyed
-    agrees = ~(np.abs(errors) > max(within, 1e-9))  # of our own node both currents are the same multiple of one step
+    agrees = ~(np.abs(errors) > max(within, 1e-9))  # of our node both are the same multiple of one step
     reported = counted & (obeyed != UNKNOWN) & (obeyed != NO_COUNTER)
     errors = errors[counted & np.isfinite(errors)]
     limit = bench.limits.current
@@ -149,9 +149,9 @@ def _disagreements(log: RunLog, bench: Bench, samples: Samples, delay: int, with
 
 
 def _acted(log: RunLog, bench: Bench, samples: Samples, by_charge: Floats, delay: int, within: float) -> Floats:
-    """Current that acted in each period [A], shape (n,).
+    """Applied current in each period [A], shape (n,).
 
-    By the report of the sample at its end, else by the charge, else the command, else the node's own stop.
+    By the report of the sample at its end, else by the charge, else the command, else the node's stop.
     """
     commanded, currents = _commanded(log, samples, delay), samples.applied[1:].copy()
     if within > 0.0:
@@ -169,7 +169,7 @@ def _acted(log: RunLog, bench: Bench, samples: Samples, by_charge: Floats, delay
 
 
 def _brakes(bench: Bench, velocity: Floats) -> Floats:
-    """Current of the node's own stop in a period without report and without known command [A]."""
+    """Current of the node's stop in a period without report and command [A]."""
     if bench.node.stop == "freewheel":
         return np.zeros(len(velocity))
     limit, damping_velocity = bench.limits.current, bench.node.damping_velocity
@@ -179,7 +179,7 @@ def _brakes(bench: Bench, velocity: Floats) -> Floats:
 def _start(log: RunLog, bench: Bench) -> tuple[float, float, float]:
     """Angle [rad], velocity [rad/s], and standard deviation of the angle [rad] before the experiment.
 
-    A resting brake has rested since the node was idle: its samples are averaged.
+    The samples of a resting brake since the node was idle are averaged.
     """
     before: list[SensorSample] = samples_before(log, bench, REST_SAMPLES)
     resting = [sample for sample in before if sample.node_state == NodeState.IDLE] or before
@@ -194,8 +194,8 @@ def _start(log: RunLog, bench: Bench) -> tuple[float, float, float]:
 def currents_by_charge(samples: Samples, bench: Bench, layout: Layout) -> Floats:
     """Currents of the periods before single lost samples, from the charge of the samples on both sides.
 
-    The charge is reported in steps of the current over a period, so that such a current is known to the step that
-    commands have: the rounding moves the brake by less than a thousandth of the sensors' noise.
+    The step of the reported charge is that of the commands' current over a period: the rounding moves the brake by less
+    than a thousandth of the sensors' noise.
 
     Returns:
         [A], NaN for every other period, shape (n,).
@@ -231,7 +231,7 @@ class Samples(NamedTuple):
 
     angle: Floats  # [rad]
     velocity: Floats  # [rad/s]
-    late: Floats  # Lateness after the grid, by the node's own stamps [s]
+    late: Floats  # Lateness after the grid, by the node's stamps [s]
     applied: Floats  # Current that acted in the period before the sample [A]
     sent: Floats  # Current of the command for the sample, as a mapped drive's bus carried it [A]; NaN if none was sent
     charge: Floats  # Integral of the current up to the sample, by the node's report [A·s]; NaN where none came
@@ -258,15 +258,15 @@ def samples_on_grid(log: RunLog, bench: Bench, planned: int) -> Samples:
             buffer += np.asarray(values).tobytes()
     step = np.frombuffer(steps, np.int64)
     if not len(step) or step[-1] < 1:
-        raise LogError(f"{log.path}: not one whole period of the experiment is left")
+        raise LogError(f"{log.path}: not one complete period of the experiment is in it")
     last = min(int(step[-1]), planned)
-    chosen = slice(None) if last == step[-1] else step <= last
+    inside = slice(None) if last == step[-1] else step <= last
     floats, counters = np.empty((6, last + 1)), np.empty((2, last + 1), np.int8)
     grid: list[Any] = [*floats, *counters]
     for column, lost in zip(grid, LOST, strict=True):
         column[:] = lost
         values = np.frombuffer(buffers.pop(0), column.dtype)
-        column[step[chosen]] = values[chosen]  # of two samples of one step the later one counts
+        column[step[inside]] = values[inside]  # of two samples of one step the later one counts
     return Samples(*grid)
 
 
@@ -281,8 +281,8 @@ def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[tuple[In
     origin_ns: Integers | None = None
     for part in log.batches("/cycle", reports.topic, charges.topic):
         obeyed, charge = reports.of_the_cycles(part), charges.of_the_cycles(part)
-        chosen = in_experiment(part["/cycle"])
-        cycles = {name: column[chosen] for name, column in part["/cycle"].items()}
+        inside = in_experiment(part["/cycle"])
+        cycles = {name: column[inside] for name, column in part["/cycle"].items()}
         steps = cycles["step"]
         if not len(steps):
             continue
@@ -306,8 +306,8 @@ def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[tuple[In
             (since_ns - steps * period_ns) * 1e-9,
             cycles["applied_current"],
             np.where(answered, quantised(cycles["sent_current"], log.drive), np.nan),
-            charge[chosen],
-            _counters(obeyed[chosen]),
+            charge[inside],
+            _counters(obeyed[inside]),
             _counters(np.where(answered, cycles["command_counter"], UNKNOWN)),
         )
         yield steps[on_time], Samples(*(column[on_time] for column in samples))
@@ -315,19 +315,19 @@ def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[tuple[In
         why = log.missing or f"it never became active ({log.exit_reason})"
         raise LogError(f"{log.path}: no experiment in this log: {why}")
     if not reports.found:
-        raise LogError(f"{log.path}: the frames of the experiment are missing: what acted is not known")
+        raise LogError(f"{log.path}: the frames of the experiment are missing: the applied currents are not in it")
 
 
 def _counters(values: NDArray[Any]) -> NDArray[np.int8]:
-    """Counters in little memory; one that cannot be is the first that cannot be."""
+    """Counters in little memory; impossible ones become the first impossible value."""
     result: NDArray[np.int8] = np.clip(values, UNKNOWN, COUNTER_MODULUS + 1).astype(np.int8)
     return result
 
 
 def in_experiment(cycles: Table) -> Booleans:
     """Mask of the control cycles that belong to the experiment."""
-    chosen: Booleans = (cycles["state"] == RunState.ACTIVE) & (cycles["step"] >= 0)
-    return chosen
+    inside: Booleans = (cycles["state"] == RunState.ACTIVE) & (cycles["step"] >= 0)
+    return inside
 
 
 def _measured(cycles: Table, layout: Layout) -> Booleans:
@@ -342,7 +342,7 @@ def _measured(cycles: Table, layout: Layout) -> Booleans:
 
 
 class _Reports:
-    """The node's reports of what acted before each sample, in a message with the counter of the sample.
+    """The node's reports about the period before each sample, in a message with the counter of the sample.
 
     Two messages of a sample are at most ``apart_ns`` apart; ``unknown`` stands where no report came.
     """
@@ -351,7 +351,7 @@ class _Reports:
         self.topic = f"/emb/{message}"
         self.columns = ("Counter", signal)
         self._signal, self._unknown, self._apart_ns = signal, unknown, apart_ns
-        self.found = False  # There was a report for any of the cycles
+        self.found = False  # True after a report for any of the cycles
         if self.topic in log.topics:
             log.require(self.topic, self.columns)
         self._recent = dict.fromkeys((*self.columns, "publish_time"), np.empty(0, np.int64))
@@ -362,20 +362,20 @@ class _Reports:
         told = np.full(len(cycles["step"]), self._unknown)
         if self.topic not in part:
             return told
-        known = {name: np.concatenate([old, part[self.topic][name]]) for name, old in self._recent.items()}
-        self._recent = {name: column[-_RECENT:] for name, column in known.items()}
-        before = np.searchsorted(known["publish_time"], cycles["publish_time"], side="right")  # a file has any order
-        left = np.arange(len(told))  # nearly always it is the last message before the cycle
+        reports = {name: np.concatenate([old, part[self.topic][name]]) for name, old in self._recent.items()}
+        self._recent = {name: column[-_RECENT:] for name, column in reports.items()}
+        before = np.searchsorted(reports["publish_time"], cycles["publish_time"], side="right")  # a file has any order
+        remaining = np.arange(len(told))  # nearly always it is the last message before the cycle
         for back in range(1, _RECENT + 1):
-            left = left[before[left] >= back]
-            if not len(left):
+            remaining = remaining[before[remaining] >= back]
+            if not len(remaining):
                 break
-            at = before[left] - back
-            apart_ns = np.abs(cycles["publish_time"][left] - known["publish_time"][at])
-            fits = (known["Counter"][at] == cycles["counter"][left]) & (apart_ns <= self._apart_ns)
-            told[left[fits]] = known[self._signal][at[fits]]
-            self.found |= bool(fits.any())
-            left = left[~fits]
+            at = before[remaining] - back
+            apart_ns = np.abs(cycles["publish_time"][remaining] - reports["publish_time"][at])
+            matches = (reports["Counter"][at] == cycles["counter"][remaining]) & (apart_ns <= self._apart_ns)
+            told[remaining[matches]] = reports[self._signal][at[matches]]
+            self.found |= bool(matches.any())
+            remaining = remaining[~matches]
         return told
 
 
@@ -405,10 +405,10 @@ def samples_before(log: RunLog, bench: Bench, count: int) -> list[SensorSample]:
 
 def _frames(received: Table, layout: Layout, end: int | None, count: int) -> list[Frame]:
     """The last frames of samples up to a time in the log."""
-    chosen = np.isin(received["id"], (layout.angle.identifier, layout.velocity.identifier))
+    of_samples = np.isin(received["id"], (layout.angle.identifier, layout.velocity.identifier))
     if end is not None:
-        chosen &= received["publish_time"] <= end
-    at = np.flatnonzero(chosen)[-count:]
+        of_samples &= received["publish_time"] <= end
+    at = np.flatnonzero(of_samples)[-count:]
     rows = (received[name][at].tolist() for name in ("id", "data", "publish_time", "is_extended", "is_rtr", "is_error"))
     return [Frame(*row) for row in zip(*rows, strict=True)]
 
@@ -419,17 +419,17 @@ def step_of(measured: Measured) -> float:
 
 
 def quantised(currents: Floats, drive: Mapping | None) -> Floats:
-    """Currents of commands as the drive's own message carries them; of our own node, as they are [A]."""
+    """Currents of commands in the steps of the drive's message; of our node, unchanged [A]."""
     if drive is None or drive.command.field.is_float:
         return currents
     field, factor = drive.command.field, drive.command.factor
-    with np.errstate(over="ignore"):  # a damaged log may say anything
+    with np.errstate(over="ignore"):  # a damaged log may contain anything
         steps: Floats = np.round((currents * factor - field.offset) / field.scale)
         return (steps * field.scale + field.offset) / factor
 
 
 def match_tolerance(drive: Mapping | None, layout: Layout) -> float:
-    """Distance from the report within which a command acted; 0 for our own node, which reports exactly [A].
+    """Largest distance from the report at which a command counts; 0 for our node, which reports exactly [A].
 
     Two quantisation steps: one between node and drive, one between drive and actuator.
     """

@@ -1,12 +1,12 @@
-"""The one model of an experiment: what the instruments show of a brake under its currents, and the derivatives of that.
+"""The model of an experiment: samples of a brake under its currents by its instruments, and their sensitivities.
 
-:func:`simulate` is what information, fits, score tests, held-out predictions, the check of a design and commissioning
-compute with. In it are a late command, an unknown place of contact, gaps in the reports, the lateness of samples, and
-the errors of sensors. A filter, which corrects the state between two samples, has a loop of its own
-(:mod:`emb_bench.estimate.innovations`) around the same period and the same :func:`emb_bench.sim.instruments.reading`.
+Information, fits, score tests, held-out predictions, the check of a design and commissioning all use :func:`simulate`.
+It includes late commands, an unknown place of contact, gaps in the reports, the lateness of samples, and errors of the
+sensors. A filter corrects the state between two samples, so it has another loop (:mod:`emb_bench.estimate.innovations`)
+around the same period and the same :func:`emb_bench.sim.instruments.reading`.
 
-**Gaps.** A single period of which no report says what acted has an unknown current. After several in a row the brake is
-somewhere: it is put to where the next sample shows it, and its angle and velocity there are unknown.
+**Gaps.** The current of a single period without report is an unknown. After several such periods in a row the state is
+set to the next sample, and its angle and velocity are unknowns.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from emb_bench.brake.parameters import COMMAND, DELAY
 from emb_bench.config.plants import Instruments, Plant
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.sim.instruments import reading, sensor_share
-from emb_bench.sim.open_loop import Input, check_unknowns, delay_share, held, march, march_shares, trajectory
+from emb_bench.sim.open_loop import Input, check_unknowns, delay_share, march, march_shares, trajectory, zero_order_hold
 from emb_runtime.config.bench import BrakeParameters
 
 
@@ -38,7 +38,7 @@ NO_ERRORS = SystematicErrors()
 
 
 class Theta(NamedTuple):
-    """Values of all that a brake's motion and its samples depend on, besides the currents."""
+    """Parameters, start and errors that determine motion and samples, besides the currents."""
 
     brake: BrakeParameters
     start: tuple[float, float] = (0.0, 0.0)  # Angle [rad] and velocity [rad/s] before the first period
@@ -52,7 +52,7 @@ class Theta(NamedTuple):
     def begin(self, before: float, params: Sequence[str]) -> tuple[Floats, Integers, Floats]:
         """State after a current ``before`` [A], indices of the unknowns, sensitivities to them.
 
-        As :func:`emb_bench.brake.motion.advance` takes them: a contact elsewhere is a brake that lies elsewhere, for
+        In the form of :func:`emb_bench.brake.motion.advance`. Another place of contact is a shift of the angle, for
         nothing else depends on the place.
         """
         x = rest()
@@ -61,7 +61,7 @@ class Theta(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """Motion of a brake, samples of it by undisturbed sensors, and their sensitivities."""
+    """Motion of a brake, its samples without noise, and their sensitivities."""
 
     states: Floats
     """Angle [rad] and velocity [rad/s] at the n + 1 instants that the samples y_0..y_n show, shape (n + 1, 2)."""
@@ -69,7 +69,7 @@ class Trajectory(NamedTuple):
     sensitivities: Floats
     """Of the samples to the parameters, then to what is unknown in the gaps, shape (n, unknowns, 2).
 
-    Relative for the brake's parameters, θ_i ∂y/∂θ_i at its own θ (eq. 4.17); per unit for those in ``UNITS``, for the
+    Relative for the brake's parameters, θ_i ∂y/∂θ_i at its θ (eq. 4.17); per unit for those in ``UNITS``, for the
     current of a single lost report [A], and for angle and velocity after a longer gap.
     """
 
@@ -104,22 +104,22 @@ def simulate_parts(
     """
     check_unknowns(params)
     errors, delay = theta.errors, plant.instruments.measurement_delay
-    # A command that acts early is counted to first order, for which its sensitivity is needed.
+    # A negative delay is linearised, which needs its sensitivity.
     early = ("delay",) if errors.delay < 0.0 and "delay" not in params else ()
-    x, chosen, s = theta.begin(parts[0].before, (*params, *early))
-    if delay:  # rows that the next samples show: until it has passed, the start
+    x, indices, s = theta.begin(parts[0].before, (*params, *early))
+    if delay:  # states of the next samples: until the delay has passed, the start
         waiting = (
             np.repeat(x[None], delay, axis=0),
             np.pad(np.repeat(s[None], delay, axis=0), ((0, 0), (0, parts[0].gap_unknowns), (0, 0))),
         )
     for part in parts:
         acting = _acting(plant, theta, part, t_s)
-        states, moved = trajectory(loop, plant.mechanics, theta.brake, acting, chosen, x, s)
+        states, moved = trajectory(loop, plant.mechanics, theta.brake, acting, indices, x, s)
         x, s, n = states[-1], moved[-1], part.periods
         if delay:
             states, moved = (np.concatenate(both) for both in zip(waiting, (states, moved), strict=True))
             waiting = states[n:-1], moved[n:-1]
-        unknowns = np.append(chosen, np.full(part.gap_unknowns, COMMAND))
+        unknowns = np.append(indices, np.full(part.gap_unknowns, COMMAND))
         shown = _shown(states[: n + 1], moved[: n + 1], unknowns, theta, theta.offset(plant), part.late, t_s)
         if early:
             shown = shown._replace(sensitivities=np.delete(shown.sensitivities, len(params), axis=1))
@@ -135,7 +135,7 @@ def simulate_shares(
     shares: Floats,
     loop: Callable[..., None] = march_shares,
 ) -> Floats:
-    """Sensitivities of the samples to unknowns that count in each period by a share, shape (n, m, 2).
+    """Sensitivities of the samples to unknowns with weights in each period, the ``shares``, shape (n, m, 2).
 
     The unknowns are indices in ``PARAMETERS``, or ``COMMAND``; the shares have the shape (n, m).
     """
@@ -162,38 +162,38 @@ def simulate_apart(
     params: Sequence[str],
     loop: Callable[..., None],
 ) -> Trajectory:
-    """As :func:`simulate`, experiments without gaps that do not follow from each other, their rows one below the other.
+    """As :func:`simulate`, independent experiments without gaps, rows stacked.
 
-    Each has its own of the ``starts``, angle [rad] and velocity [rad/s], shape (m, 2).
+    Each begins at its row of ``starts``, angle [rad] and velocity [rad/s], shape (m, 2).
     """
     errors, delay = theta.errors, plant.instruments.measurement_delay
     early = ("delay",) if errors.delay < 0.0 and "delay" not in params else ()
     ends = np.cumsum([window.periods + 1 for window in windows])
     first = np.append(0, ends[:-1])
-    origin, chosen, s = theta.begin(0.0, (*params, *early))
+    origin, indices, s = theta.begin(0.0, (*params, *early))
     states, moved = np.zeros((ends[-1], len(origin))), np.zeros((ends[-1], *s.shape))
     states[first], moved[first] = origin, s
     states[first, :2] = starts - [theta.contact, 0.0]
     states[first, 3] += [window.before for window in windows]
     late, late_by = np.zeros(ends[-1]), max(errors.delay, 0.0)
     for window, a, b in zip(windows, first.tolist(), ends.tolist(), strict=True):
-        acting = held(window.currents + errors.current_offset, t_s, late_by)
-        loop(plant.mechanics, theta.brake, acting, chosen, states[a:b], moved[a:b])
+        acting = zero_order_hold(window.currents + errors.current_offset, t_s, late_by)
+        loop(plant.mechanics, theta.brake, acting, indices, states[a:b], moved[a:b])
         if window.late is not None:
             late[a + 1 : b] = window.late
     if delay:
         seen = np.maximum(np.arange(ends[-1]) - delay, np.repeat(first, np.diff(ends, prepend=0)))
         states, moved = states[seen], moved[seen]
-    shown = _shown(states, moved, chosen, theta, theta.offset(plant), late[1:], t_s)
+    shown = _shown(states, moved, indices, theta, theta.offset(plant), late[1:], t_s)
     real = np.delete(np.arange(ends[-1]), first) - 1  # no sample is between the end of one and the start of the next
     return Trajectory(shown.states, shown.samples[real], shown.sensitivities[real, : len(params)])
 
 
 def gap_ends(experiment: Experiment, instruments: Instruments) -> tuple[Integers, Floats]:
-    """Periods at whose ends the brake is found again after longer gaps, and where: angle [rad], velocity [rad/s].
+    """Periods at whose ends the state is set after longer gaps, and that state: angle [rad], velocity [rad/s].
 
-    They are those of the first sample that shows it, not one period earlier: integrating back through a standstill
-    cannot recover the velocity. The place is the one that an estimate has found, or else as measured.
+    They are those of the first sample after the gap, not one period earlier: integration back through a standstill
+    cannot recover the velocity. The place is that of an estimate, or else the measured one.
     """
     delay, last = instruments.measurement_delay, experiment.periods - 1
     breaks = np.minimum(experiment.gaps[1] + int(delay == 0), last)
@@ -206,7 +206,7 @@ def gap_ends(experiment: Experiment, instruments: Instruments) -> tuple[Integers
 
 
 def later(rows: Floats, delay: int) -> Floats:
-    """Rows, shape (n, ...), as they are seen ``delay`` rows later; until then the first one."""
+    """Rows, shape (n, ...), delayed by ``delay`` rows; until then the first one."""
     return np.concatenate([np.repeat(rows[:1], delay, axis=0), rows])[: len(rows)]
 
 

@@ -39,7 +39,7 @@ def read_theta(
         return "nominal", bench.brake, NO_ERRORS
     if log is not None and choice == "true":
         if log.truth is None:
-            raise UsageError("--theta true: this log does not know the brake's true parameters, only a simulated one's")
+            raise UsageError("--theta true: only the log of a simulated brake has its true parameters")
         for name, value in log.truth._asdict().items():
             check_near_nominal(bench, name, value, "--theta true: ")
         return choice, log.truth, NO_ERRORS
@@ -86,19 +86,19 @@ def _from_file(path: str, log: RunLog | None, bench: Bench) -> tuple[dict[str, f
     try:
         found = read_document(path, _Estimate, path)
     except OSError as err:
-        known = ("nominal",) if log is None else (LOG, "nominal", "true")
-        expected = f"expected {', '.join(known)}, name=value or a file{near(path, known)}"
+        choices = ("nominal",) if log is None else (LOG, "nominal", "true")
+        expected = f"expected {', '.join(choices)}, name=value or a file{near(path, choices)}"
         raise UsageError(f"--theta: {expected}; {path}: {err.strerror}") from err
     names = PARAMETER_NAMES if bench.machine is None else (*PARAMETER_NAMES, "J")
-    shown = {name: quantity(bench.machine, name).name for name in names}
-    values = {name: _number(found.parameters[own]) for name, own in shown.items() if own in found.parameters}
+    labels = {name: quantity(bench.machine, name).name for name in names}
+    values = {name: _number(found.parameters[label]) for name, label in labels.items() if label in found.parameters}
     if not values:
         raise UsageError(f"{path}: expected an estimate of some of {', '.join(names)}, and it has none of them")
     return values, _errors(found, path, log, bench)
 
 
 def _errors(found: _Estimate, path: str, log: RunLog | None, bench: Bench) -> SystematicErrors:
-    """Systematic errors of a log in an estimate of some records; the encoder's offset is each record's own."""
+    """Systematic errors of a log in an estimate of some records; the encoder's offset is that of the record."""
     limits = {"current_offset": bench.limits.current, "delay": 1.0, "velocity_gain": 1.0}
     labels = {name: quantity(bench.machine, name).name for name in limits}
     records = [Path(record.name).name for record in found.records]

@@ -14,7 +14,7 @@ if TYPE_CHECKING:  # a search for designs takes a second to import
     from emb_bench.design.report import Check, Report
 
 
-def text(report: Report, written: str = "", *, verbose: bool = False) -> str:
+def design_text(report: Report, written: str = "", *, verbose: bool = False) -> str:
     """Value of the criterion, and limits and smallest repeatabilities on the brake of the design."""
     d, nominal = report.metadata(), report.checks[0]
     alone = "" if report.problem.weights.velocity else " of the angle alone"

@@ -26,7 +26,7 @@ SCALE = "below that: docs/howto/below-two-percent.md"  # If J limits an interval
 NOTICED = 2.0  # Score above which an effect without an alarm is named [standard deviations]
 
 
-def text(study: Study, *, verbose: bool = False) -> str:
+def study_text(study: Study, *, verbose: bool = False) -> str:
     """Verdict, parameters, what limits them, next step; with ``verbose`` also the evidence."""
     e, found = study.estimate, verdict(study)
     lines = [
@@ -143,7 +143,7 @@ def _evidence(study: Study) -> Iterator[str]:
     yield from listed("", (f"profile of {p.label}: {say.profile(p, e)}" for p in study.checks.profiles))
 
 
-def document(study: Study) -> dict[str, Any]:
+def study_document(study: Study) -> dict[str, Any]:
     """Everything about a study; numbers may be infinite."""
     e, checks = study.estimate, study.checks
     choice = checks.choice

@@ -34,7 +34,7 @@ CRITERIA = {
 }
 
 
-def document(e: Evaluation) -> dict[str, Any]:
+def fim_document(e: Evaluation) -> dict[str, Any]:
     """Everything about the information, for ``--json``; a number that is not finite becomes null."""
     x, question, fisher, verdict = e.experiment, e.question, e.fisher("physical"), e.identifiability()
     times = (np.array(e.instants) + 1) * e.bench.timing.sample_time
@@ -98,7 +98,7 @@ def expected_interval(e: Evaluation) -> Interval | str:
         return str(err)
 
 
-def text(e: Evaluation, *, verbose: bool = False) -> str:
+def fim_text(e: Evaluation, *, verbose: bool = False) -> str:
     """Defects of the log, then the smallest possible repeatabilities; with ``verbose`` the criteria over time."""
     doubts, lines = [*listed("WARNING: ", say.warnings(e)), *listed("NOTE: ", say.notes(e))], _heading(e)
     velocity = "" if e.fit.velocity is None else f", velocity {plain(e.fit.velocity)}"

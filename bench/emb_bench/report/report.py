@@ -24,7 +24,7 @@ from emb_bench.report import figures, tables, trend
 from emb_bench.report import sentences as say
 from emb_bench.report.acceptance import Acceptance
 from emb_bench.report.caveats import caveats
-from emb_bench.report.estimate import document as estimate_document
+from emb_bench.report.estimate import study_document
 from emb_bench.report.information import assumed_currents, lacks
 from emb_bench.report.motion import REASONS, Motion
 from emb_bench.report.page import (
@@ -598,7 +598,7 @@ def _care(text: str) -> Text | None:
 # ---- the document ----
 
 
-def document(report: Report) -> dict[str, Any]:
+def report_document(report: Report) -> dict[str, Any]:
     """JSON document with the content of the page; numbers may be infinite."""
     study = report.study
     estimated = study.joint is not None
@@ -613,7 +613,7 @@ def document(report: Report) -> dict[str, Any]:
             "predicts": study.checks.predicts if estimated else None,
             "why_no_estimate": study.why_not,
             "left_out": [{"log": path, "why": why} for path, why in report.left_out],
-            "estimate": estimate_document(study) if estimated else None,
+            "estimate": study_document(study) if estimated else None,
             "compared": study.side_by_side[1].checks.drifts if study.side_by_side else None,
             "runs": [_run_document(run, one) for run, one in zip(study.runs, studies, strict=True)],
         }

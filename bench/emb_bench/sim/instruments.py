@@ -47,9 +47,9 @@ def settle(instruments: Instruments, memory: Any, angle: float) -> None:
     memory[-2], memory[-1] = shown, 0.0
 
 
-def command(instruments: Instruments, memory: Any, wanted: float) -> float:
-    """Current that acts in this period, in which ``wanted`` is requested [A]. To be called once a period."""
-    return _delayed(memory, _COMMANDS, instruments.command_delay, wanted)
+def command(instruments: Instruments, memory: Any, requested: float) -> float:
+    """Current that acts in the period of a ``requested`` one [A]. To be called once a period."""
+    return _delayed(memory, _COMMANDS, instruments.command_delay, requested)
 
 
 def reading(x1: Any, x2: Any, acceleration: Any, late: Any, offset: float, velocity_scale: float) -> tuple[Any, Any]:

@@ -1,4 +1,4 @@
-"""The brake as a CAN node: it drives the motor, obeys what is fresh, valid and enabled, and stops by itself.
+"""The brake as a CAN node: it drives the motor, obeys fresh, valid and enabled commands, and stops by itself.
 
 Pure logic: frames and ticks go in, frames come out; no clock and no socket. ``emb-node`` drives it in real time, the
 ``sim`` transport in lock-step.
@@ -7,9 +7,9 @@ In the tick of sample k the node takes the command that answered sample k − 1,
 between them with that current, measures, and sends angle and velocity. So a command acts in the very period whose
 beginning it answers, or never: a late one is refused as stale, and a period without a command is braked.
 
-That is what the node decides; a plant with a command delay lets a command act some periods later. The node then names
-the command that it has taken and reports the current that acts: a drive measures its own. Its own braking does not
-wait. The time stamps are those of the grid: they know neither of a delayed measurement nor of a clock that jitters.
+A plant with a command delay applies an accepted command some periods later. The node then reports the counter of the
+accepted command and the current that acts, which a drive measures. The node's braking has no delay. The time stamps are
+those of the grid, without a delay of the measurement or jitter of the clock.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ REST_TIME = 0.05  # s
 """The brake rests when it has stayed within REST_TRAVEL for so long. The velocity is no criterion: Euler's sign() makes
 it chatter by ± T_c t_s / J = 2.2 rad/s where the brake stands still."""
 
-NOTHING_ASKED = math.nan  # On its way to the motor where no command is
+NO_COMMAND = math.nan  # Current without a command
 
 
 class Rest:
@@ -90,7 +90,7 @@ class BrakeNode(SimulatedBrake):
         return (self.samples - 1) % COUNTER_MODULUS
 
     def receive(self, frame: Frame) -> None:
-        """Take one frame from the bus; only a valid, fresh command for this sample is kept."""
+        """Take one frame from the bus; only a valid, fresh command for this sample is accepted."""
         if frame.identifier != self._layout.command.identifier or frame.own or frame.error:
             return
         try:
@@ -104,7 +104,7 @@ class BrakeNode(SimulatedBrake):
             self.rejected += 1
             return
         if not taken.enable and taken.current != 0.0:
-            self.rejected += 1  # it contradicts itself; that it stops the brake is heard all the same
+            self.rejected += 1  # contradictory, but it stops the brake all the same
         self._command = taken
 
     def tick(self, skipped: int = 0) -> list[Frame]:
@@ -114,10 +114,10 @@ class BrakeNode(SimulatedBrake):
         they are braked.
         """
         for _ in range(skipped + 1):
-            asked, answered_by = self._take_command()
-            asked = self._delayed(asked)
-            obeys = self.state is NodeState.ACTIVE and not math.isnan(asked)
-            applied = asked if obeys else self._own_current()
+            commanded, answered_by = self._take_command()
+            commanded = self._delayed(commanded)
+            obeys = self.state is NodeState.ACTIVE and not math.isnan(commanded)
+            applied = commanded if obeys else self._stop_current()
             angle, velocity = self._advance(applied)
             if self._charge is not None:
                 self._charge += applied * self._t_s
@@ -127,7 +127,7 @@ class BrakeNode(SimulatedBrake):
     def _permitted(self, taken: CurrentCommand) -> bool:
         if abs(taken.current) > self._bench.limits.current:
             return False
-        # A stop that has latched is finished first, and a disabled command is always heard.
+        # A latched stop is finished first; a disabled command is always accepted.
         return not taken.enable or self.state in (NodeState.IDLE, NodeState.ACTIVE)
 
     def _take_command(self) -> tuple[float, int]:
@@ -145,13 +145,13 @@ class BrakeNode(SimulatedBrake):
             self._idle_periods += 1
             if self._idle_periods >= self._watchdog_periods:
                 self._latch(StopReason.WATCHDOG)
-        return NOTHING_ASKED, NO_COUNTER
+        return NO_COMMAND, NO_COUNTER
 
     def _latch(self, reason: StopReason) -> None:
         self.state, self.stop_reason = NodeState.STOPPING, reason
         self._rest = Rest(self.angle)
 
-    def _own_current(self) -> float:
+    def _stop_current(self) -> float:
         """Current of a drive without commands: the damped stop, or none [A]."""
         if self.state is NodeState.IDLE or self._bench.node.stop == "freewheel":
             return 0.0

@@ -6,7 +6,7 @@ current answers it, are :mod:`emb_bench.estimate.innovations` on :func:`advance_
 Python.
 
 **Which samples count.** A sequence of n currents u_0..u_{n−1} moves the brake from the state x_0 to x_n, and the
-samples y_1..y_n after each period count. y_0 holds no information on a brake that starts from a known state (eq. 4.26).
+samples y_1..y_n after each period count. y_0 has no information on a brake with a given initial state (eq. 4.26).
 
 **Late switching.** A command that acts ``late`` periods after it was due leaves the one before it in force until then.
 
@@ -28,22 +28,22 @@ from emb_bench.config.plants import Mechanics
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError, near
 
-WORTH_COMPILING = 20_000  # Periods from which on loading the compiled functions takes less time than they save
+WORTH_COMPILING = 20_000  # Periods above which the compiled functions save more time than their loading takes
 
 
 class Input(NamedTuple):
-    """Currents of n periods, and places where the brake is put after periods without a report."""
+    """Currents of n periods, and states that are set after gaps in the reports."""
 
     currents: Floats  # [A], shape (n,)
     t_s: float  # Period [s]
-    late: float  # Share of a period in which the command before still acts, 0 to below 1
+    late: float  # Part of a period in which the previous command still acts, 0 to below 1
     pulses: Integers  # Single periods whose current is an unknown, in ascending order, shape (g,)
-    breaks: Integers  # Periods at whose ends the brake is put somewhere after longer gaps, ascending, shape (h,)
+    breaks: Integers  # Periods at whose ends the state is set after longer gaps, ascending, shape (h,)
     places: Floats  # Angle [rad] and velocity [rad/s] at these ends, shape (h, 2)
 
 
-def held(currents: Floats, t_s: float, late: float = 0.0) -> Input:
-    """Input of currents [A] that are known in every period of ``t_s`` [s], ``late`` periods late."""
+def zero_order_hold(currents: Floats, t_s: float, late: float = 0.0) -> Input:
+    """Input of currents [A], each constant over a period of ``t_s`` [s], ``late`` periods late, without gaps."""
     none = np.zeros(0, np.int64)
     return Input(currents, t_s, late, none, none, np.zeros((0, 2)))
 
@@ -53,35 +53,35 @@ def trajectory(
     mechanics: Mechanics,
     p: BrakeParameters,
     acting: Input,
-    chosen: Integers,
+    unknowns: Integers,
     x: Floats,
     s: Floats,
 ) -> tuple[Floats, Floats]:
     """States and sensitivities at all instants, from those at the first one.
 
-    Shapes (n + 1, STATES) and (n + 1, m + g + 2 h, SENSITIVE) of m parameters ``chosen``, then of the unknowns of the
-    gaps: the currents of ``pulses`` [per A], angle and velocity at the end of each of ``breaks``. ``loop`` is
-    :func:`march`, as it is or compiled.
+    Shapes (n + 1, STATES) and (n + 1, m + g + 2 h, SENSITIVE): to the m ``unknowns``, then to those of the gaps, the
+    currents of ``pulses`` [per A], angle and velocity at the end of each of ``breaks``. ``loop`` is :func:`march`, as
+    it is or compiled.
     """
-    n, unknowns = len(acting.currents), len(chosen) + len(acting.pulses) + 2 * len(acting.breaks)
-    states, sensitivities = np.empty((n + 1, STATES)), np.zeros((n + 1, unknowns, SENSITIVE))
-    states[0], sensitivities[0, : len(chosen)] = x, s
-    loop(mechanics, p, acting, chosen, states, sensitivities)
+    n, rows = len(acting.currents), len(unknowns) + len(acting.pulses) + 2 * len(acting.breaks)
+    states, sensitivities = np.empty((n + 1, STATES)), np.zeros((n + 1, rows, SENSITIVE))
+    states[0], sensitivities[0, : len(unknowns)] = x, s
+    loop(mechanics, p, acting, unknowns, states, sensitivities)
     return states, sensitivities
 
 
-def march(mechanics: Mechanics, p: BrakeParameters, acting: Input, chosen: Integers, x: Floats, s: Floats) -> None:
+def march(mechanics: Mechanics, p: BrakeParameters, acting: Input, unknowns: Integers, x: Floats, s: Floats) -> None:
     """Fills states ``x`` and sensitivities ``s`` from their first rows on; see :func:`trajectory`.
 
-    A single period of which it is not known what acted adds its current to the unknowns. After a longer gap the brake
-    is put to where it is taken to be, and its angle and velocity there are unknowns: what came before says nothing of
-    what comes after. Runs as it is or compiled (:func:`emb_bench.compiled.compiled`).
+    The current of a single period without report is an unknown. After a longer gap the state is set to the assumed one,
+    and its angle and velocity are unknowns: the sensitivities to the motion before the gap are zero. Runs as it is or
+    compiled (:func:`emb_bench.compiled.compiled`).
     """
     t_s, late, pulses, breaks, places = acting.t_s, acting.late, acting.pulses, acting.breaks, acting.places
-    m, count = chosen.shape[0], chosen.shape[0] + pulses.shape[0]
+    m, count = unknowns.shape[0], unknowns.shape[0] + pulses.shape[0]
     every = np.full(s.shape[1], PAST_COMMAND)
     for j in range(m):
-        every[j] = chosen[j]
+        every[j] = unknowns[j]
     before, begun, broken, unknown = float(x[0, 3]), 0, 0, -1
     for k in range(acting.currents.shape[0]):
         _carry(x, s, k)
@@ -110,20 +110,20 @@ def march(mechanics: Mechanics, p: BrakeParameters, acting: Input, chosen: Integ
 
 
 def march_shares(
-    mechanics: Mechanics, p: BrakeParameters, acting: Input, chosen: Integers, shares: Floats, x: Floats, s: Floats
+    mechanics: Mechanics, p: BrakeParameters, acting: Input, unknowns: Integers, shares: Floats, x: Floats, s: Floats
 ) -> None:
-    """Fills states ``x``, and sensitivities ``s`` to unknowns ``chosen`` that count in each period by a share.
+    """Fills states ``x``, and sensitivities ``s`` to ``unknowns`` with weights in each period, the ``shares``.
 
     The ``shares``, shape (n, m), may be any numbers. The gaps have no unknowns here. Runs as it is or compiled.
     """
-    every, before, broken = chosen.copy(), float(x[0, 3]), 0
+    every, before, broken = unknowns.copy(), float(x[0, 3]), 0
     for k in range(acting.currents.shape[0]):
         _carry(x, s, k)
         after_gap = broken < acting.breaks.shape[0] and acting.breaks[broken] == k
         if after_gap:
             x[k + 1, 0], x[k + 1, 1] = acting.places[broken, 0], acting.places[broken, 1]
         u = float(acting.currents[k])
-        advance_shares(mechanics, p, x[k + 1], before, u, acting.t_s, acting.late, chosen, shares, k, every, s[k + 1])
+        advance_shares(mechanics, p, x[k + 1], before, u, acting.t_s, acting.late, unknowns, shares, k, every, s[k + 1])
         before = u
         if after_gap:
             _put(x, s, k, acting.places[broken])
@@ -138,7 +138,7 @@ def advance_shares(
     u: float,
     t_s: float,
     late: float,
-    chosen: Integers,
+    unknowns: Integers,
     shares: Floats,
     k: int,
     every: Integers,
@@ -146,28 +146,31 @@ def advance_shares(
 ) -> None:
     """Period ``k``, in which the command ``u`` [A] acts late, and the one ``before`` [A] until then; in place.
 
-    A delay's sensitivity counts a switch by the time step that it begins, here the shorter one: it has to be divided
-    by :func:`delay_share`. The last of the unknowns ``chosen`` count by their ``shares``, shape (n, m): a period's map
-    of a sensitivity is affine, s → A s + b with b of the unknown, and a share w takes s to w (A s/w + b); none is
-    the current of another period. ``every`` is a copy of ``chosen``, which changes.
+    A delay's sensitivity is per duration of the step after the switch, here the shorter one: it has to be divided by
+    :func:`delay_share`. The last of the ``unknowns`` have weights, the ``shares`` of shape (n, m): a period's map of a
+    sensitivity is affine, s → A s + b with b of the unknown, and with a weight w it is s → w (A s/w + b); a weight of
+    zero makes it the current of another period. ``every`` is a copy of ``unknowns``, which changes.
     """
     if late > 0.0:
-        _share_out(chosen, shares, k, True, True, every, s)
+        _share_out(unknowns, shares, k, True, True, every, s)
         advance(mechanics, p, x, before, late * t_s, every, s)
-        _share_out(chosen, shares, k, True, False, every, s)
-    _share_out(chosen, shares, k, False, True, every, s)
+        _share_out(unknowns, shares, k, True, False, every, s)
+    _share_out(unknowns, shares, k, False, True, every, s)
     advance(mechanics, p, x, u, (1.0 - late) * t_s, every, s)
-    _share_out(chosen, shares, k, False, False, every, s)
+    _share_out(unknowns, shares, k, False, False, every, s)
 
 
-def _share_out(chosen: Integers, shares: Floats, k: int, late: bool, begins: bool, every: Integers, s: Floats) -> None:
-    """Sensitivities over the shares of a part of a period where it ``begins``, times these where it ends.
+def _share_out(
+    unknowns: Integers, shares: Floats, k: int, late: bool, begins: bool, every: Integers, s: Floats
+) -> None:
+    """Divides sensitivities by the weights at the begin of a part of a period, multiplies them at its end.
 
-    In the ``late`` part, of the command before, that command and its motor constant have the share of their own period.
+    In the ``late`` part the previous command still acts: it and its motor constant have the weight of the period
+    before.
     """
-    first = chosen.shape[0] - shares.shape[1]
+    first = unknowns.shape[0] - shares.shape[1]
     for j in range(shares.shape[1]):
-        unknown, share = int(chosen[first + j]), shares[k, j]
+        unknown, share = int(unknowns[first + j]), shares[k, j]
         if late and unknown in (K_M, COMMAND):
             share = shares[k - 1, j] if k > 0 else 0.0
         if begins:
@@ -188,7 +191,7 @@ def _carry(x: Floats, s: Floats, k: int) -> None:
 
 
 def _put(x: Floats, s: Floats, k: int, place: Floats) -> None:
-    """Put the brake to an angle and a velocity at the end of period k, which depend on nothing before."""
+    """Set angle and velocity at the end of period k, without sensitivities to the motion before."""
     x[k, 1] = 2.0 * place[1] - x[k + 1, 1]  # keeps the acceleration near the place
     for i in range(2):
         x[k + 1, i] = place[i]
@@ -197,7 +200,7 @@ def _put(x: Floats, s: Floats, k: int, place: Floats) -> None:
 
 
 def delay_share(unknown: int, late: float) -> float:
-    """Divisor that makes a sensitivity from :func:`advance_shares` one per sample: 1, but for the delay's own."""
+    """Divisor of a sensitivity from :func:`advance_shares` to make it one per sample: 1, except for the delay."""
     return 1.0 - late if unknown == DELAY else 1.0
 
 
@@ -214,10 +217,10 @@ def feedback(
     """
     x = rest()
     x[:2] = x0
-    chosen, s = no_sensitivity(())
+    unknowns, s = no_sensitivity(())
     for k in count():
         u = law(float(x[0]), float(x[1]), k)
-        advance(mechanics, p, x, u, t_s, chosen, s)
+        advance(mechanics, p, x, u, t_s, unknowns, s)
         yield u, float(x[0]), float(x[1])
 
 
@@ -237,7 +240,7 @@ def check_unknowns(params: Sequence[str]) -> None:
     """Refuses names that are no parameters of a brake or its instruments."""
     for name in params:
         if name not in PARAMETERS:
-            known = f"{', '.join(PARAMETERS)}{near(name, PARAMETERS)}"
-            raise UsageError(f"'{name}' is no parameter of the brake; expected some of {known}")
+            names = f"{', '.join(PARAMETERS)}{near(name, PARAMETERS)}"
+            raise UsageError(f"'{name}' is no parameter of the brake; expected some of {names}")
     if len(set(params)) < len(params):
         raise UsageError(f"a parameter comes twice in {', '.join(params)}: expected each once")

@@ -29,13 +29,13 @@ from emb_runtime.safety.shield import Past
 from emb_runtime.safety.shield_design import ShieldLaw
 
 
-def clipped(wanted: float, limit: float) -> float:
+def clipped(requested: float, limit: float) -> float:
     """A current within ±limit [A]; one that is not finite counts as 0 A, as it does for the shield."""
-    return min(max(wanted, -limit), limit) if math.isfinite(wanted) else 0.0
+    return min(max(requested, -limit), limit) if math.isfinite(requested) else 0.0
 
 
 def sent_current(
-    law: ShieldLaw, shield: bool, angle: float, velocity: float, wanted: float, past: Past, step: int, limit: float
+    law: ShieldLaw, shield: bool, angle: float, velocity: float, requested: float, past: Past, step: int, limit: float
 ) -> tuple[float, int]:
     """Current for a measurement [A], NaN for none, and the :class:`~emb_runtime.records.Reason` bits.
 
@@ -43,8 +43,8 @@ def sent_current(
     law's; without the shield the current is clipped to the law's, no more.
     """
     if not shield:
-        return clipped(wanted, law.current), 0
-    return shielded(law, angle, velocity, clipped(wanted, limit), past, step, -limit, limit)
+        return clipped(requested, law.current), 0
+    return shielded(law, angle, velocity, clipped(requested, limit), past, step, -limit, limit)
 
 
 def pass_period(
@@ -55,17 +55,17 @@ def pass_period(
     current: float,
     errors: tuple[float, float, float],
     x: Floats,
-    chosen: Integers,
+    unknowns: Integers,
     s: Floats,
     memory: Any,
 ) -> tuple[float, float]:
     """Let one sample period pass, in place; gives measured angle [rad] and velocity [rad/s] at its end.
 
     Errors are of the angle [rad], the velocity [rad/s] and the instant of the sample [s]. ``x`` is the state, shape
-    [4], ``chosen`` has the indices of the n unknowns, ``s`` their sensitivities, shape [n, 4].
+    [4], ``unknowns`` has the indices of the n unknowns, ``s`` their sensitivities, shape [n, 4].
     """
     before = float(x[1])
-    advance(mechanics, p, x, current, t_s, chosen, s)
+    advance(mechanics, p, x, current, t_s, unknowns, s)
     x1, x2 = float(x[0]), float(x[1])
     return measure(instruments, memory, t_s, x1, x2, (x2 - before) / t_s, errors[2], errors[0], errors[1])
 
@@ -104,9 +104,9 @@ class SimulatedBrake:
         """True velocity [rad/s]."""
         return float(self._x[1])
 
-    def _delayed(self, asked: float) -> float:
-        """Current that acts in the coming period where ``asked`` is ordered [A]; NaN stands for none, in both."""
-        return command(self._instruments, self._memory, asked)
+    def _delayed(self, commanded: float) -> float:
+        """Current that acts in the coming period for a ``commanded`` one [A]; NaN without a command, in both."""
+        return command(self._instruments, self._memory, commanded)
 
     def _advance(self, current: float) -> tuple[float, float]:
         """Let one period pass; what is measured at its end, angle [rad] and velocity [rad/s]."""
@@ -128,7 +128,7 @@ class SimulatedBrake:
         return measured
 
 
-NOISES = ("angle_noise", "velocity_noise")  # Options for sensors that are not as the bench file says
+NOISES = ("angle_noise", "velocity_noise")  # Options for sensors with other noise than in the bench file
 LONGEST_SEED = 18  # Digits of a seed
 FARTHEST = 100.0  # A brake that is farther from nominal, by this factor, is a typing error
 
@@ -154,9 +154,9 @@ def true_parameters(
     theta = bench.brake
     for name, given in assignments.items():
         if name not in PARAMETER_NAMES:
-            known = (*PARAMETER_NAMES, *besides)
-            said = f"'{name}' is not a parameter; expected one of {', '.join(known)}{near(name, known)}"
-            raise UsageError(f"{option}{said}")
+            names = (*PARAMETER_NAMES, *besides)
+            expected = f"expected one of {', '.join(names)}{near(name, names)}"
+            raise UsageError(f"{option}'{name}' is not a parameter; {expected}")
         value = _number(given)
         check_near_nominal(bench, name, value, option, got=f"'{given}'")
         theta = theta._replace(**{name: value})
@@ -191,7 +191,7 @@ def read_brake(text: str, bench: Bench, option: str) -> BrakeToSimulate:
     """Reads ``plant=exact,seed=3,f_v=3e-5``; what is not given is the default plant, seed 1, nominal.
 
     ``charge=1`` has the node send the integral of its current; ``angle_noise`` [rad] and ``velocity_noise`` [rad/s] are
-    standard deviations of sensors that are not as the bench file says. ``temperature`` [degC] with ``supply_voltage``
+    standard deviations of sensors that differ from the bench file. ``temperature`` [degC] with ``supply_voltage``
     [V] has the node send them. ``option`` begins a message.
     """
     return brake_of(parse_assignments(text, option), bench, option)

@@ -40,7 +40,7 @@ class SteppedClock:
     def advance_to(self, time_ns: int) -> None:
         """Move time on, never back."""
         if time_ns < self._now_ns:
-            raise ValueError(f"time cannot go back: it is {self._now_ns} ns, asked for {time_ns} ns")
+            raise ValueError(f"time cannot go back: it is {self._now_ns} ns, got {time_ns} ns")
         self._now_ns = time_ns
 
 
@@ -87,7 +87,7 @@ class LockstepBus:
         return self._queue.popleft()
 
     def close(self) -> None:
-        """Nothing is held."""
+        """There is nothing to release."""
 
 
 class SimTransport(LockstepBus):

@@ -19,7 +19,7 @@ from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.records import EstimationProblem, Unknown
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.logs.log import RunLog, read_log
-from emb_bench.report.estimate import document, text
+from emb_bench.report.estimate import study_document, study_text
 from emb_bench.report.sentences import models
 from emb_runtime.config.bench import PARAMETER_NAMES
 
@@ -104,7 +104,7 @@ def test_a_study_with_all_models_says_which_it_took_and_why(bench: Bench, tmp_pa
     log = read_log(write_log(tmp_path / "a.mcap", simulate(square_wave, options="plant=stribeck")))
     found = make_study(bench, [log], EstimateOptions(model=EVERY, starts=1))
     assert found.estimate.plant.name == "stribeck"
-    said = document(found)
+    said = study_document(found)
     # With the encoder's offset estimated too, 'offset' is 'exact'.
     assert [*{model["model"] for model in said["models"]} ^ {*bench.plants}] == said["models_left_out"] == ["offset"]
     assert said["models"][0]["model"] == said["model"] == "stribeck"
@@ -124,12 +124,12 @@ def test_two_models_that_a_record_cannot_tell_apart_are_named_in_one_sentence(
     """In 200 samples play of 0.3 rad explains no less than the brake that was there, and comes first by chance."""
     log = square_log(tmp_path, simulate, "exact", 200)
     found = make_study(bench, [log], EstimateOptions(model=EVERY, starts=1))
-    assert document(found)["not_told_apart"] == ["play", "exact"]
+    assert study_document(found)["not_told_apart"] == ["play", "exact"]
     choice = found.checks.choice
     assert choice is not None
     assert all(c.fits for c in choice.plausible)
     sentence = models(found)
-    assert sentence in " ".join(text(found).split())
+    assert sentence in " ".join(study_text(found).split())
     page = make(tmp_path / "a.html", log.path, "--model", EVERY, "--starts", "1")
     assert sentence[1:] in page.reader.text
     alone = choice.best.estimate.intervals()
@@ -145,7 +145,7 @@ def test_of_models_that_are_all_alike_the_simplest_one_answers(
     log = square_log(tmp_path, simulate, "exact", 100, -1.0)
     found = make_study(bench, [log], EstimateOptions(model=EVERY, starts=1))
     assert found.estimate.plant.name == "exact"
-    assert {"exact", "cubic", "hysteresis", "play"} <= {*document(found)["not_told_apart"]}
+    assert {"exact", "cubic", "hysteresis", "play"} <= {*study_document(found)["not_told_apart"]}
 
 
 def test_plants_are_compared_with_the_errors_that_the_bench_cannot_exclude(bench: Bench) -> None:

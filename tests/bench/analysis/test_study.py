@@ -26,7 +26,7 @@ from emb_bench.estimate.records import EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.identifiability import Doubt
 from emb_bench.logs.log import RunLog, read_log
-from emb_bench.report.estimate import document, text
+from emb_bench.report.estimate import study_document, study_text
 from emb_bench.report.information import DOUBTS
 from emb_bench.report.sentences import alarms, apart, remedies
 from emb_bench.report.sentences import profile as sentence
@@ -69,7 +69,7 @@ def test_a_record_that_is_not_predicted_decides_like_residuals_that_do_not_fit(b
     found = replace(together, checks=replace(together.checks, held_out=(replace(first, fits=False), second)))
     assert found.model_fits
     assert all(c.standing is Standing.IF_MODEL_RIGHT for c in conclude(found.estimate, (), (), predicts=False))
-    got = document(found)
+    got = study_document(found)
     assert (got["model_fits"], got["predicts"]) == (True, False)
     assert verdict(found).model is Code.DOES_NOT_PREDICT
 
@@ -161,7 +161,7 @@ def test_two_brakes_in_one_call_are_said_to_fit_each_alone(bench: Bench, log: Lo
     first, other = log("plant=exact,seed=1"), log("plant=exact,seed=2,k_m=0.0225")
     study = make_study(bench, [first, other], options)
     assert study.checks.apart[0].name == "k_m"
-    assert " ".join(apart(study).split()) in " ".join(text(study).split())
+    assert " ".join(apart(study).split()) in " ".join(study_text(study).split())
     for second in ("plant=exact,seed=2", "plant=stribeck,seed=2"):  # one brake, and one that the model does not know
         assert make_study(bench, [first, log(second)], options).checks.apart == ()
 
@@ -190,7 +190,7 @@ def test_the_first_remedy_for_each_choice_of_parameters_is_a_command_that_gives_
         assert all(c.interval[0] in (-np.inf, 0.0) or c.interval[0] > 0.0 for c in study.conclusions)
         assert verdict(study).holds == (name in chosen)
         if not verdict(study).holds:
-            cause = document(study)["misfit"]["cause"]
+            cause = study_document(study)["misfit"]["cause"]
             assert name in cause["fixed"]
             assert alarms(study.estimate)[0].startswith(
                 ("one of " if len(cause["fixed"]) > 1 else "") + cause["fixed"][0]

@@ -14,7 +14,7 @@ from emb_bench.analysis.stages import make_study
 from emb_bench.analysis.study import Code, Result, Study, Tone, verdict
 from emb_bench.information.identifiability import Doubt
 from emb_bench.logs.log import read_log
-from emb_bench.report.estimate import text
+from emb_bench.report.estimate import study_text
 
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.benches import SENSOR_BENCH  # isort: skip
@@ -119,8 +119,8 @@ def test_no_effect_is_below_the_level_of_an_alarm_where_the_model_does_not_fit(s
         suspects = (replace(e.validation.suspects[0], sigmas=2.9, p_value=0.02, possible=True),)
         return replace(study, joint=replace(e, validation=replace(e.validation, suspects=suspects)))
 
-    assert "below the level of an alarm" in text(hinted(study), verbose=True)
-    assert "below the level of an alarm" not in text(hinted(misfit(study)), verbose=True)
+    assert "below the level of an alarm" in study_text(hinted(study), verbose=True)
+    assert "below the level of an alarm" not in study_text(hinted(misfit(study)), verbose=True)
 
 
 def test_nothing_is_good_without_an_estimate_or_of_a_simulated_brake(study: Study) -> None:

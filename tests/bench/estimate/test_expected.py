@@ -13,7 +13,7 @@ from emb_bench.api import fisher_information
 from emb_bench.brake.parameters import COMMAND, F_V, K_1, K_M, T_C
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Plant
-from emb_bench.estimate.effects import EFFECTS, Linearised, Prediction, Simulation, columns, with_systematic
+from emb_bench.estimate.effects import EFFECTS, Linearised, Prediction, Simulation, regressors, with_systematic
 from emb_bench.estimate.expected import Interval, of_experiment, of_information
 from emb_bench.estimate.innovations import Filter, FilterPrediction
 from emb_bench.estimate.prediction import Problem, make_problem
@@ -128,7 +128,7 @@ def test_what_a_friction_leaves_beside_the_model_is_that_of_a_brake_that_has_it(
     (more, less) = (model.whitened_samples(0, m) for m in (changed, changed._replace(break_away=1.0)))
     change = ((more - less) / 1e-5).ravel()
     wanted = change - basis @ (basis.T @ change)
-    found = lacking(columns(problem, z, model, jacobian, (name,)), basis, inverse).beside[0]
+    found = lacking(regressors(problem, z, model, jacobian, (name,)), basis, inverse).beside[0]
     assert np.linalg.norm(found - wanted) < 0.05 * np.linalg.norm(wanted)
 
 
@@ -175,7 +175,7 @@ def test_one_effect_moves_the_parameters_by_regression(bench: Bench) -> None:
     weights = problem.weights(z)
     jacobian = problem.jacobian(z, weights)[1]
     ones = Simulation(problem, z, weights)
-    column = columns(problem, z, ones, jacobian, ("k_m_drift",))["k_m_drift"]
+    column = regressors(problem, z, ones, jacobian, ("k_m_drift",))["k_m_drift"]
     moved, square, *_ = np.linalg.lstsq(jacobian, column, rcond=None)
     information, squares, weights_of = float(square[0]), 0.0, 0.5  # half the brakes have none
     for share in (1e-3, 1e-2, 0.1, 1.0):

@@ -261,8 +261,8 @@ def test_a_log_without_an_experiment_its_frames_or_a_whole_period_is_refused(
         records[:] = [record for record in records if not isinstance(record, kind) or next(numbers) < kept]
     for run, why in (
         (none, r"never became active \(INTERRUPTED\)"),
-        (without_frames, "what acted is not known"),
-        (without_period, "not one whole period"),
+        (without_frames, "the applied currents are not in it"),
+        (without_period, "not one complete period"),
     ):
         with pytest.raises(LogError, match=why):
             recorded(tmp_path, run)

@@ -77,7 +77,7 @@ def test_parameters_are_known_from_a_log_of_a_drive_that_tells_its_current_coars
     assert [c.label for c in study.conclusions] == list(PARAMETER_NAMES)
     (note,) = assumptions(study)
     assert f"the command on the bus, {in_samples(late)} late" in note
-    assert f"NOTE: {note}" in " ".join(report.text(study).split())
+    assert f"NOTE: {note}" in " ".join(report.study_text(study).split())
     information = api.fisher_information(log, model="exact")
     assert isinstance(information, Evaluation)
     assert note in notes(information)

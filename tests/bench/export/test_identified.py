@@ -31,7 +31,7 @@ from emb_bench.experiment.simulate import Theta
 from emb_bench.export.c_source import OUTPUTS, c_source
 from emb_bench.export.export import write_model
 from emb_bench.export.identified import CHOSEN, Identified, drawn
-from emb_bench.sim.open_loop import held, march, trajectory
+from emb_bench.sim.open_loop import march, trajectory, zero_order_hold
 from emb_runtime.config.bench import PARAMETER_NAMES
 
 from tests.bench.conftest import Replay  # isort: skip
@@ -57,7 +57,7 @@ def profile(seed: int, periods: int = 400) -> Floats:
 def expected(found: Identified, currents: Floats) -> Floats:
     """States after each period by the bench's simulation."""
     x, chosen, s = Theta(found.brake, contact=found.contact).begin(0.0, ())
-    states, _ = trajectory(march, found.mechanics, found.brake, held(currents, T_S), chosen, x, s)
+    states, _ = trajectory(march, found.mechanics, found.brake, zero_order_hold(currents, T_S), chosen, x, s)
     shown: Floats = states[1:] + np.array([found.contact, 0.0, 0.0, 0.0])
     return shown
 

@@ -21,7 +21,7 @@ from emb_bench.config.bench import load_bench
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.logs.log import read_log
 from emb_bench.report.acceptance import accept, read_criteria
-from emb_bench.report.estimate import document
+from emb_bench.report.estimate import study_document
 from emb_runtime.errors import UsageError
 
 from tests.bench.conftest import Replay  # isort: skip
@@ -91,7 +91,7 @@ def test_a_relative_tolerance_is_of_nominal_or_of_its_reference(tmp_path: Path, 
 def test_drift_is_judged_against_an_earlier_estimate_and_not_without_one(
     tmp_path: Path, folder: Path, study: Study
 ) -> None:
-    last = msgspec.convert(document(study), Earlier)
+    last = msgspec.convert(study_document(study), Earlier)
     k_1 = last.parameters["k_1"]
     moved = {**last.parameters, "k_1": msgspec.structs.replace(k_1, value=0.9 * k_1.value)}
     changed = msgspec.structs.replace(last, parameters=moved)

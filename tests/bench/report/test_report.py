@@ -36,7 +36,7 @@ from emb_bench.report.figures import applied_as_sent
 from emb_bench.report.motion import Motion
 from emb_bench.report.page import html
 from emb_bench.report.report import Report as Made
-from emb_bench.report.report import document, intervals, page_of, with_units
+from emb_bench.report.report import intervals, page_of, report_document, with_units
 from emb_bench.report.sentences import MORE, effects
 from emb_runtime.errors import EXIT_OUTSIDE, LogError
 from emb_runtime.log.ring_buffer import Attachment, EventRecord
@@ -411,7 +411,7 @@ def test_real_time_is_in_the_table(folder: Path, bench: Bench, simulate: Simulat
     page = html(page_of(real))
     assert "bench on can0" in page
     assert "Time was simulated" not in page
-    assert document(real)["runs"][0]["timing"]["intervals"]["response"]["p100"] == pytest.approx(343.001e-6)
+    assert report_document(real)["runs"][0]["timing"]["intervals"]["response"]["p100"] == pytest.approx(343.001e-6)
 
 
 def test_a_report_replaces_a_report_but_never_what_it_reads(folder: Path, good: Path, replay: Replay) -> None:
