@@ -61,7 +61,7 @@ class Named(msgspec.Struct, frozen=True):
 
 
 class Earlier(msgspec.Struct, frozen=True):
-    """An earlier estimate, as far as it is compared."""
+    """The compared part of an earlier estimate."""
 
     parameters: Annotated[dict[str, Entry], msgspec.Meta(min_length=1)]
     model: str = ""

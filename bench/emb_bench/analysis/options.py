@@ -113,14 +113,14 @@ class FitOptions(SearchOptions):
         known_values(self.known)
 
     def method_on(self, bench: Bench) -> str:
-        """The method: the one that is given, or the usual one of the bench's machine."""
+        """The given method, or the default for the bench's machine."""
         method = self.method or ("oem" if bench.machine is None else "windows")
         if self.window and method != "windows":
             raise UsageError(f"--window: the method {method} has no windows; leave it out, or add --method windows")
         return method
 
     def problem(self, bench: Bench, plant: Plant) -> EstimationProblem:
-        """The unknowns of a plant, with the systematic errors that it can have where they are estimated too."""
+        """The problem for a plant, with the bench's systematic errors unless ``systematic`` is none."""
         from emb_bench.estimate.effects import with_systematic
 
         priors = known_values(self.known)
@@ -186,7 +186,7 @@ class ReportOptions(EstimateOptions):
     compare: bool = option(False, "two runs side by side, each estimated alone, and their differences")
 
     def __post_init__(self) -> None:
-        """Refuse what needs one estimate beside a comparison of two."""
+        """Refuse a comparison of two runs with options that need one estimate."""
         super().__post_init__()
         refused = [f"--{name}" for name in ("last", "acceptance", "junit") if getattr(self, name) is not None]
         if self.compare and refused:

@@ -1,9 +1,9 @@
 """Likelihood profiles: rise of χ² over one unknown, with all the others refitted at each of its values.
 
-The Fisher information is a parabola at the estimate; a profile follows the likelihood itself, however curved, up to
-the border of the search (Raue et al., Structural and practical identifiability analysis of partially observed
-dynamical models by exploiting the profile likelihood, Bioinformatics 25, 2009, section 2.2). The unknown is fixed at
-points of a grid that begins at the minimum and widens while the rise is small; at each the others are refitted, from an
+The Fisher information is a parabola at the estimate; a profile follows the likelihood itself, however curved, up to the
+border of the search (Raue et al., Structural and practical identifiability analysis of partially observed dynamical
+models by exploiting the profile likelihood, Bioinformatics 25, 2009, section 2.2). The unknown is fixed at points of a
+grid that begins at the minimum and widens while the rise is small; at each the others are refitted, from an
 extrapolation of the last points. For an estimate by any method the likelihood is that of output error, with all priors
 in full.
 """

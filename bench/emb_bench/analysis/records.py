@@ -32,7 +32,7 @@ class Profile:
     doubt: Doubt | None
     """None if it is closed, else ``FLAT`` (open on both sides), ``OPEN_BELOW``, ``OPEN_ABOVE`` or ``CUT``."""
     fisher: tuple[float, float]
-    """95 % by the Fisher information, around the profile's minimum; infinite where it identifies nothing."""
+    """95 % by the Fisher information, around the profile's minimum; infinite if not identified."""
     minimum: float  # Value with the least χ², SI units
     fell: float  # Fall of χ² below that of the estimate, which is then a local minimum only; 0 if none
 

@@ -165,7 +165,7 @@ class Study:
 
     @property
     def correlation(self) -> Floats:
-        """Correlations by the covariance; an error of J, with which all torques scale, makes them large."""
+        """Correlations by the covariance; large because an error of J scales all torques."""
         covariance = self.covariance
         deviations = np.sqrt(np.diag(covariance))
         with np.errstate(invalid="ignore"):  # inf of what is not identified

@@ -61,9 +61,9 @@ def report(
 ) -> Report:
     """One page about runs of one brake, to hand over, and a JSON file beside it.
 
-    The verdict comes first, then the evidence. The page is one file for screen and paper. An unusable log is
-    named and skipped. A run without an experiment is reported without an estimate. With ``compare`` two runs
-    stand side by side, each estimated alone, with the differences of their parameters; the worse verdict counts.
+    The verdict comes first, then the evidence. The page is one file for screen and paper. An unusable log is named and
+    skipped. A run without an experiment is reported without an estimate. With ``compare`` two runs stand side by side,
+    each estimated alone, with the differences of their parameters; the worse verdict counts.
 
     Args:
         runs: MCAP files of emb-run, of one brake; with a map, recordings of others. Unusable ones are named

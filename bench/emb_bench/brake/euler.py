@@ -1,16 +1,16 @@
 """The thesis's brake under forward Euler, sign() and all, and its sensitivities: plain scalar functions.
 
-The state is the motor angle x1 [rad] (contact at 0) and the motor velocity x2 [rad/s], the input the motor current
-u [A]. Each identified parameter enters the equation of motion (eq. 3.12-3.14) through exactly one torque and linearly:
+The state is the motor angle x1 [rad] (contact at 0) and the motor velocity x2 [rad/s], the input the motor current u
+[A]. Each identified parameter enters the equation of motion (eq. 3.12-3.14) through exactly one torque and linearly:
 motor ∝ k_m, clamping ∝ k_1, Coulomb friction ∝ T_c, viscous friction ∝ f_v. So :func:`torque` is at once a term of the
 dynamics and that term's derivative with respect to its relative parameter, θ_i ∂/∂θ_i.
 
-``sign(0) = 0``, and the brake is in contact at x1 ≥ 0, as eq. 3.13 prints it. The derivative of sign() is taken as zero
-everywhere, as automatic differentiation takes it: at a sign change of x2 these sensitivities are those of the thesis
-and not those of the brake.
+``sign(0) = 0``, and the brake is in contact at x1 ≥ 0, as in eq. 3.13. The derivative of sign() is zero everywhere, as
+in automatic differentiation: at a sign change of x2 these sensitivities are those of the thesis, not those of the
+brake.
 
-All of it runs as it is in the simulated node and, compiled by :func:`emb_bench.compiled.compiled`, bit for bit the same
-in the batch.
+The functions run as plain Python in the simulated node and compiled by :func:`emb_bench.compiled.compiled` in the
+batch, with the same bits.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def torque(p: BrakeParameters, x1: float, x2: float, u: float, i: int) -> float:
     """The torque that parameter ``i`` of ``PARAMETERS`` scales, signed as it acts on the motor (eq. 3.12-3.14) [N·m].
 
     It is also θ_i times its derivative with respect to θ_i. The inertia scales the acceleration: its share is −J ẍ. The
-    derivatives to the angle of contact [N·m/rad] and to an offset of the current [N·m/A] are
-    absolute; any other parameter has none, 0.
+    derivatives to the angle of contact [N·m/rad] and to an offset of the current [N·m/A] are absolute; those to other
+    parameters are 0.
     """
     if i == K_M:
         return p.k_m * u
@@ -79,8 +79,8 @@ def sensitivity_step(
     """One step of the sensitivity to the *relative* parameter ``i`` (eq. 4.25; eq. 5.6 for f_v, 6.1 for k_1).
 
     Relative means θ_i ∂x/∂θ_i with the value that ``p`` has: to normalise by another value θ_nom,i instead (eq. 4.17),
-    multiply the sensitivity by θ_nom,i / θ_i. Angle, velocity and their sensitivities s1 and s2, 0 at the start
-    (eq. 4.26), are those before the step; it returns the sensitivities after it.
+    multiply the sensitivity by θ_nom,i / θ_i. Angle, velocity and their sensitivities s1 and s2, 0 at the start (eq.
+    4.26), are those before the step; it returns the sensitivities after it.
     """
     restoring = stiffness(p, x1) * s1 + p.f_v * s2
     return s1 + t_s * s2, s2 + t_s * ((torque(p, x1, x2, u, i) - restoring) / p.J)

@@ -223,8 +223,8 @@ def _cut(
 def _root(m: Mechanics, p: BrakeParameters, a: Slide, before: float, h: float, which: int, goal: float) -> float:
     """The shortest step, up to ``h``, with which angle, velocity or acceleration has come to ``goal`` [s].
 
-    The Illinois variant of regula falsi (Dowell and Jarratt, BIT 11, 1971), which keeps a bracket: what it returns lies
-    on the far side of the event.
+    The Illinois variant of regula falsi (Dowell and Jarratt, BIT 11, 1971), which keeps a bracket: the result lies on
+    the far side of the event.
     """
     low, high, moved = 0.0, h, 0
     f_low = (a.x1 if which == _ANGLE else a.x2 if which == _VELOCITY else before) - goal

@@ -1,6 +1,6 @@
 """One sample period of any plant: state and sensitivities, in place.
 
-Plain Python on numpy arrays; compiled by :func:`emb_bench.compiled.compiled` it is what the batch runs.
+Plain Python on numpy arrays; the batch runs it compiled by :func:`emb_bench.compiled.compiled`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ PLAIN = Mechanics()
 
 def is_plain(m: Mechanics) -> bool:
     """Returns True if a brake solved exactly has none of the features beyond the thesis's equations."""
-    return m[1:-1] == PLAIN[1:-1]  # but for the solver, and the tolerance with which features are integrated
+    return m[1:-1] == PLAIN[1:-1]  # except the solver and the tolerance of the integration
 
 
 def rest() -> Floats:

@@ -1,4 +1,4 @@
-"""The one table of what can be estimated from a record: parameters of a brake, of its features and its instruments.
+"""The table of unknowns: parameters of a brake, of its features and its instruments.
 
 The thesis identifies k_m, k_1, T_c and f_v. The record also depends on nuisance parameters, which are estimated, and on
 constants, whose errors enter the uncertainty. The row of a parameter has its unit, search range, score test and remedy;
@@ -267,7 +267,7 @@ _OF_LINEAR = {
 
 
 class Quantity(NamedTuple):
-    """Name and SI unit of a result as it is shown."""
+    """Name and unit of a result in the output."""
 
     name: str
     unit: str  # ``1`` for a share

@@ -1,14 +1,14 @@
-"""Simulated annealing of a design's speeds, sample by sample: what a polish cannot reach.
+"""Simulated annealing of a design's speeds: it leaves the local optima of a polish.
 
-A polish keeps the samples at which a brake moves forwards and those at which it moves backwards, and ends on a corner
-of what that pattern allows. The optima of E are full of short hops during a slow creep, and each set of hops is a local
-optimum of its own. Here the pattern itself varies: blocks of speeds are shifted, replaced, moved, and hops are added,
-and the currents follow by dead beat. A worse variation is accepted with a falling probability (Kirkpatrick, Gelatt and
-Vecchi, Science 220, 1983). Variations are judged one by one: the best of several would mostly be one that changes
-nothing. Only the periods from the first change on are simulated again.
+A polish keeps the direction of motion of every sample, and ends on a corner of the set with this pattern. The optima of
+E have many short hops during a slow creep, and each set of hops is a local optimum. The annealing varies the pattern:
+it shifts, replaces and moves blocks of speeds, and adds hops; the currents follow by dead-beat control. A worse
+variation is accepted with a falling probability (Kirkpatrick, Gelatt and Vecchi, Science 220, 1983), one variation at a
+time: the best of several would mostly be one without effect. Only the periods after the first change are simulated
+again.
 
 Without it, E of the three held-out Euler brakes of docs/figures.md ends at 0.939 to 0.948 of the best found instead of
-0.994 and more, and D at 0.987 to 0.999; more designs that are polished to their ends do not help.
+0.994 and more, and D at 0.987 to 0.999; polishing more designs to convergence does not help.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from emb_bench.information.symmetric import Floats, packed_size, phi
 VARIATIONS = 28  # Variations that one annealing simulates for each sample of a design
 TEMPERATURE = 2e-4  # Mean loss of φ that is accepted at the start; it falls to zero as a parabola
 SOFTNESS = 0.03
-"""Softness of the criterion at the start, which rounds E's kinks; it falls to zero in the warmer half. Where the two
-smallest eigenvalues are equal, as in all good designs for E, hardly a variation makes both larger at once."""
-PRICE = 0.3  # Share of the price of leaving the box that a variation pays: the polish brings it back in
+"""Initial softness of the criterion, which rounds E's kinks; it falls to zero in the warmer half. In good designs for E
+the two smallest eigenvalues are equal, and hardly a variation increases both."""
+PRICE = 0.3  # Share of the price of leaving the box for a variation, which the polish moves back into it
 HOPELESS = 0.05  # Loss by that price beyond which a variation is dropped before its information is computed
 TWICE = 0.4  # Share of the variations that are two changes
 AT_TURNS = 0.4  # Share of the changes that begin near a turn
@@ -41,7 +41,7 @@ HIT = 1e-3  # Distance from a speed that counts as having reached it [rad/s]
 
 
 class Tracks(NamedTuple):
-    """Designs that were given by their speeds, and what they do."""
+    """Designs given by their speeds, with their trajectories."""
 
     speeds: Floats  # Reached at the ends of the periods, shape (count, n) [rad/s]
     u: Floats  # Currents, shape (count, n) [A]
@@ -63,7 +63,7 @@ def annealed(problem: Problem, speeds: Floats, rng: np.random.Generator) -> Floa
 
 
 def tracked(problem: Problem, speeds: Floats) -> Tracks:
-    """Designs that reach speeds, shape (count, n) [rad/s], as far as the currents' limit lets them."""
+    """Designs that follow speeds, shape (count, n) [rad/s], within the currents' limit."""
     start = problem.task.start
     count, n = speeds.shape
     s = np.zeros((count, n + 1, *start.shape))
@@ -111,7 +111,7 @@ def reach(task: Task, first: int, speeds: Floats, u: Floats, x: Floats) -> None:
 
 
 def anneal(task: Task, goal: int, count: int, rng: np.random.Generator, tracks: Tracks, best: Floats) -> None:
-    """Vary a design ``count`` times, and go on with the variation unless it is too much worse.
+    """Vary a design ``count`` times, and continue with each accepted variation.
 
     Of the two designs the first one is varied first; both change. ``best`` becomes the currents of the best design of
     the colder half.

@@ -18,22 +18,22 @@ from emb_bench.config.plants import Mechanics
 from emb_bench.information.symmetric import Floats, add_increment
 from emb_runtime.config.bench import BrakeParameters
 
-COARSE_SEARCHES = 18  # Of one design, if nobody asks for another number; the best of them go on
+COARSE_SEARCHES = 18  # Default number of coarse searches; the best designs are polished
 STATE_STEP = 1e-5
 """Half width of the differences in state and current [rad, rad/s, 1, A]: the maps are smooth, of order 1."""
 ASIDE = 2e-5
 """Least distance from contact and from rest at which the maps are differentiated [rad, rad/s]: across them they jump,
-and a jump over a difference of STATE_STEP, multiplied over some dozen samples, is beyond all numbers."""
+and a jump divided by STATE_STEP, multiplied over some dozen samples, overflows."""
 SPEED_PRICE = 0.02
-"""Price of 1 rad/s beyond the speed limit for one sample, where 1 rad beyond an angle, and 1 rad or 1 rad/s at the
-end, cost 1. More than it brings: the speed limit brings some 1e-4 per sample and rad/s, in the logarithm of a
-criterion, and home 0.1 per rad."""
+"""Price of 1 rad/s beyond the speed limit for one sample, where 1 rad beyond an angle, and 1 rad or 1 rad/s at the end,
+cost 1. It exceeds the gain: some 1e-4 in the logarithm of a criterion per sample and rad/s beyond the speed limit, and
+0.1 per rad beyond home."""
 ARRIVED = 0.02  # Distance from the end of a journey that counts as having arrived [rad]
-ARRIVAL = 4.0  # Periods that a coarse return home keeps in hand; the polish takes them back
+ARRIVAL = 4.0  # Reserve of a coarse return home [periods], which the polish uses
 
 
 class Box(NamedTuple):
-    """Limits that a design keeps: floats, so that numba takes it."""
+    """Limits of a design, as floats for numba."""
 
     current: float  # Largest current, both signs [A]
     low: float  # Lowest angle [rad]
@@ -52,7 +52,7 @@ class Task(NamedTuple):
     t_s: float  # Period [s]
     unknowns: Integers  # Indices of the unknowns in ``PARAMETERS``, shape (m,)
     start: Floats  # Their sensitivities at the start, shape (m, SENSITIVE)
-    bias: Floats  # What the encoder adds to each sensitivity of the angle, shape (m,)
+    bias: Floats  # Derivative of the encoder's reading to each unknown, shape (m,)
     w1: float  # Weight of the angle
     w2: float  # Weight of the velocity
 
@@ -95,8 +95,8 @@ def inform(task: Task, first: int, u: Floats, x: Floats, s: Floats, m: Floats) -
 def linearise(task: Task, u: Floats, x: Floats, s: Floats, jacobian: Floats) -> None:
     """Derivatives of every period's map (z, u) → z by central differences, shape (n, Z, Z + 1), the current's last.
 
-    The map is linear in the sensitivities, and each row of them moves as the brake's state does: their derivatives are
-    differences over a unit step, of one row for all.
+    The map is linear in the sensitivities, with the same derivatives for each row: one difference over a unit step
+    serves for all rows.
     """
     m = task.unknowns.shape[0]
     size = STATES + SENSITIVE * m
@@ -170,9 +170,9 @@ def gradients(task: Task, jacobian: Floats, s: Floats, result: Floats) -> None:
 def explore(task: Task, genes: Floats, u: Floats, m: Floats, price: Floats) -> None:
     """Simulate a population of coarse designs: journeys, driven by a deadbeat loop within the box.
 
-    A journey is the fastest way to an angle, and a speed from there on. Where a brake waits, and on which side of
-    contact and in which direction it creeps while it does, is worth more than how it gets there; a reference that
-    gives only speeds has it as the small difference of long ways. The loop's simple laws may miss the box.
+    A journey is the fastest way to an angle, followed by a constant speed. The place of slow creep, its side of contact
+    and its direction determine the criterion more than the way to it; a reference of speeds alone would have the place
+    as a small difference of long ways. The simple control laws may leave the box.
 
     Genes, shape (count, 3 g): the angles −1..1 of g journeys, of which the cube is the share of the angle's limit on
     that side; the speeds −1..1 thereafter, of which it is the share of the largest; their lengths in any unit.
@@ -198,7 +198,7 @@ def explore(task: Task, genes: Floats, u: Floats, m: Floats, price: Floats) -> N
                 target = angle * angle * angle * (box.high if angle > 0.0 else -box.low)
                 speed = creep * creep * creep * box.speed
                 toward = 1.0 if target > x[k, 0] else -1.0
-            distance = target - x[k, 0] - t_s * x[k, 1]  # after this period, which its current does not change much
+            distance = target - x[k, 0] - t_s * x[k, 1]  # at the end of the period; its current has little effect
             if toward * (target - x[k, 0]) <= 0.0 or abs(distance) < ARRIVED:
                 toward = 0.0
             goal = speed
@@ -214,7 +214,7 @@ def explore(task: Task, genes: Floats, u: Floats, m: Floats, price: Floats) -> N
 
 
 def deceleration(p: BrakeParameters, box: Box) -> float:
-    """Deceleration that a coarse design counts on, whatever the angle [rad/s²]."""
+    """Deceleration of a coarse design at any angle [rad/s²]."""
     motor = p.k_m * box.current
     return 0.9 * max(motor + p.T_c - p.gamma * p.k_1 * box.high * 0.5, 0.1 * motor) / p.J
 

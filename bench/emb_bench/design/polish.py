@@ -1,11 +1,11 @@
 """Every sample of a design to its local optimum: sequential linear programming with a trust region.
 
-At a design, the motion and the Fisher information are linear functions of a change of the currents, to first order: the
-maps of the single periods are differentiated, and an adjoint sweep gives every element of M. The criterion is concave
+The motion and the Fisher information are linearised in the currents: the maps of the single periods are differentiated,
+and an adjoint sweep gives every element of M. The criterion is concave
 in M, so that its tangents at a few matrices bound it from above (Kelley's cutting planes). The result is a sparse
 linear program over changes of currents and states within the limits, which HiGHS solves. A step counts if the simulated
-criterion grows. Optima of this problem lie on corners: currents at their limits, speeds at theirs, the end at the edge
-of home. That is where a linear program goes (Fletcher and Sainz de la Maza, Mathematical Programming 43, 1989).
+criterion grows. Optima of this problem lie on corners: currents and speeds at their limits, the end at the edge of
+home. So do the solutions of linear programs (Fletcher and Sainz de la Maza, Mathematical Programming 43, 1989).
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ SMALLEST_RADIUS = 1e-4  # Largest change of a current in a step at which a polis
 PATIENCE = 10  # Rounds over which the gain is judged
 CLOSE = 0.2  # Share of the gain by which the tangents may exceed the criterion when no more are added
 SLACKS = (0.0, 0.5, 1.0)
-"""Shares of what now lies outside the box that may stay there, tried in this order; the last one always has a step."""
+"""Shares of the present excess over the box that may remain, tried in this order; the last one is always feasible."""
 SLOWEST = 1.0
 """Speed below which a step leaves no sample that moves [rad/s], unless it is slower already. A step keeps the direction
 of motion of every sample, for the information of a sample jumps or bends where that changes; the annealing finds the
-best pattern. Without a floor designs end up sliding at 1e-6 rad/s for a third of the experiment, which identifies as
-much and holds for no real brake; one sigma of the velocity costs 0.003 in log det."""
+best pattern. Without a floor designs slide at 1e-6 rad/s for a third of the experiment, which no real brake does; a
+floor of one sigma of the velocity costs 0.003 in log det."""
 SLOWEST_STEPPED = 0.1
 """SLOWEST for solvers other than ``EXACT``, whose periods are linear as long as no direction changes [rad/s]."""
 NEAREST = 1e-6  # Distance from contact below which a step leaves no sample [rad]; for solvers other than ``EXACT``
@@ -87,7 +87,7 @@ class _Step:
         self.cuts = [design.matrix]
 
     def solve(self, radius: float, cuts: int) -> tuple[Floats, float]:
-        """Change of the currents within a radius [A], and the gain in :func:`merit` that is promised."""
+        """Change of the currents within a radius [A], and the predicted gain in :func:`merit`."""
         now, phi = self.design, self.problem.criterion.phi
         change, gain = np.zeros(len(now.currents)), 0.0
         for _ in range(cuts):
@@ -95,7 +95,7 @@ class _Step:
             if not change.any():
                 break
             matrix = now.matrix + np.einsum("k,kij->ij", change, self.slopes)
-            if np.linalg.eigvalsh(matrix)[0] <= 0.0:  # further than the first order holds: look half way
+            if np.linalg.eigvalsh(matrix)[0] <= 0.0:  # beyond the linear range: halve the step
                 matrix = 0.5 * (matrix + now.matrix)
                 if np.linalg.eigvalsh(matrix)[0] <= 0.0:
                     break
@@ -122,7 +122,7 @@ class _Step:
         cost = np.zeros(n + states * n + 1)
         cost[-1] = -1.0
         if not (np.isfinite(cuts).all() and np.isfinite(right).all()):
-            return np.zeros(n), 0.0, 1.0  # nothing to go by: the information is singular here, or has overflowed
+            return np.zeros(n), 0.0, 1.0  # the information is singular, or has overflowed
         for slack in SLACKS:
             found = linprog(
                 cost,

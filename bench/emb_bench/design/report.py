@@ -1,4 +1,4 @@
-"""Report on a design, computed again without anything that the search used, and its files."""
+"""Report on a design, computed independently of the search, and its files."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Check:
     log_det: float
     lambda_min: float
     trace_inverse: float
-    lowest_angle: float  # [rad], as all of these between the samples too, where the brake has anything there
+    lowest_angle: float  # [rad]; all extremes also between the samples, for a solver with states there
     highest_angle: float  # [rad]
     largest_speed: float  # [rad/s]
     largest_current: float  # [A]
@@ -56,7 +56,7 @@ class Check:
 def check(bench: Bench, problem: Problem, kind: Kind, currents: Floats, plant_name: str) -> Check:
     """Checks a sequence of currents on a brake: its criteria, and whether it keeps the bench's limits there."""
     plant = bench.model(plant_name)
-    # What the brake does, not what sensors show of it later: the last periods count, too.
+    # The motion, not delayed samples of it: the last periods count as well.
     plant = replace(plant, instruments=plant.instruments._replace(measurement_delay=0))
     t_s, p = problem.sample_time, problem.brake
     parts = PARTS if plant.mechanics.solver == EXACT else 1
@@ -89,7 +89,7 @@ def check(bench: Bench, problem: Problem, kind: Kind, currents: Floats, plant_na
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Report:
-    """A search and what came out."""
+    """A search with its result."""
 
     bench: Bench
     problem: Problem

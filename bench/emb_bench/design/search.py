@@ -1,12 +1,11 @@
 """Many coarse designs, the best of them polished, varied and polished again: multi-start, for there are many optima.
 
-A coarse design is a table of few journeys (:func:`emb_bench.design.kernel.explore`), searched for by CMA-ES (Hansen,
-The CMA evolution strategy: a tutorial, arXiv:1604.00772). Most searches end at the same optimum, and what a table is
-worth says little of what it will be worth when it is polished. So a search pays for nearness to what earlier ones have
-found, and those that go on differ: two designs are near each other if they know the same of each combination of
-parameters. Then each is polished, annealed (:mod:`emb_bench.design.anneal`) and polished a little, again and again:
-fewer and fewer of them, in the end the best one twice at a time, until it gains no more. Then it is polished to its
-end.
+A coarse design is a table of few journeys (:func:`emb_bench.design.kernel.explore`), optimised by CMA-ES (Hansen, The
+CMA evolution strategy: a tutorial, arXiv:1604.00772). Most searches end at the same optimum, and the value of a table
+predicts little of its value after a polish. So a search has a price for nearness to earlier results, and the selected
+tables differ; two designs are near if their informations on each combination of parameters are. Then rounds of
+annealing (:mod:`emb_bench.design.anneal`) and a short polish follow, with fewer designs in each round, until the best
+one gains no more. It is then polished to convergence.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from emb_bench.parallel import Lost, processors, shared_out
 from emb_runtime.errors import UsageError
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # of what it would like to have for plots
+    warnings.simplefilter("ignore")  # about optional plots
     import cma
 
 JOURNEYS = (3, 4, 5)  # Journeys of a coarse design; the searches take turns
@@ -42,7 +41,7 @@ FEW = 600  # The same for a criterion of the interval, which takes a hundred tim
 WIDE = 0.2  # Initial standard deviation of the genes, −1..1
 CLOSE = 0.05  # The same of a search that begins with the table of another brake
 POPULATION = 24  # Population of CMA-ES
-WAVES = 3  # Batches of coarse searches, each of which keeps away from what the earlier ones found
+WAVES = 3  # Batches of coarse searches; each has a price for nearness to earlier results
 NEAR = 0.3  # Distance (:func:`distances`) below which two tables count as near; those that go on are half of it apart
 NEARNESS = 0.1  # Largest price of being near to an earlier table, in the unit of φ
 LINES = 4  # Designs that are annealed; one fewer in each round, down to one
@@ -50,7 +49,7 @@ LAST = 2  # Annealings of the last design in each round, so that two processors 
 ROUNDS = 20  # Most rounds of annealing
 PATIENCE = 4  # Rounds over which the gain is judged
 GAIN = 3e-4  # Gain of φ over these rounds below which the search ends
-SOFT = 0.05  # Share of the price of leaving the box that a coarse design pays: the polish brings it back in
+SOFT = 0.05  # Share of the price of leaving the box for a coarse design, which the polish moves back into it
 FIRM = 20.0  # The same where no polish follows
 WORST = -1e3  # Worth of a table without information
 LONG = Settings(steps=80, tolerance=5e-5, cuts=4)  # Polish of every design at first, and of the best one at the end
@@ -89,10 +88,10 @@ def search(
 ) -> Found:
     """The best design of many searches; the same seed finds the same design, whatever the number of workers.
 
-    ``starts`` are coarse searches, ``workers`` threads, 0 for one per processor. ``warm`` are currents to begin with
-    too, of a criterion of the interval the genes of tables.
-    ``told`` is called after each of at most :func:`steps_of` steps, with what was done. Ctrl-C ends the search with the
-    best design so far, if there is one.
+    ``starts`` is the number of coarse searches, ``workers`` that of threads, 0 for one per processor. ``warm`` are
+    further initial currents, for a criterion of the interval the genes of tables. ``told`` is called after each of at
+    most :func:`steps_of` steps, with a description. Ctrl-C ends the search with the best design so far, if there is
+    one.
     """
     if not isinstance(problem.goal, Criterion):
         return _best_table(problem, starts, seed, workers, warm, told)
@@ -144,7 +143,7 @@ def search(
 def _best_table(
     problem: Problem, starts: int, seed: int, workers: int, warm: Sequence[Floats], told: Callable[[str], object]
 ) -> Found:
-    """The best coarse design for a criterion without a slope to climb, within the limits between samples too."""
+    """The best coarse design for a criterion without a gradient, within the limits also between samples."""
     seeds = np.random.SeedSequence(seed).spawn(starts + len(warm))
     begins: list[Floats | None] = [*[None] * starts, *warm]
     pieces = list(zip(range(len(seeds)), seeds, begins, strict=True))
@@ -225,7 +224,7 @@ def _between_samples(problem: Problem, design: Design) -> Design | None:
 
 
 def coarse(problem: Problem, journeys: int, seed: np.random.SeedSequence, far: Sequence[Table] = ()) -> Table:
-    """A table of some journeys that was searched for from random ones; nearness to tables ``far`` costs."""
+    """A table of some journeys, optimised from random ones; nearness to the tables ``far`` has a price."""
     rng = np.random.default_rng(seed)
     low, high = _borders(journeys)
     first, count = (DRAWN, FIRST) if isinstance(problem.goal, Criterion) else (FEW // 5, FEW)

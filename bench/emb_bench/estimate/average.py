@@ -8,8 +8,8 @@ Science 14, 1999).
 
 Let M be the information with all priors in full, C its inverse, and S the prior deviations of the errors η. The samples
 have the information A = C_ηη⁻¹ − S⁻² on η, and the score b = C_ηη⁻¹ η̂. With the deviations D, the errors have the
-covariance V = D (1 + D A D)⁻¹ D and the mean V b, and the posterior weight of D is its prior probability times
-|1 + D A D|^−½ exp(½ bᵀ V b). The other unknowns follow from the errors by regression.
+covariance V = D (1 + D A D)⁻¹ D and the mean V b, and the posterior weight of D is its prior probability times |1 + D A
+D|^−½ exp(½ bᵀ V b). The other unknowns follow from the errors by regression.
 """
 
 from __future__ import annotations

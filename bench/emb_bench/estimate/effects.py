@@ -40,7 +40,7 @@ from emb_bench.estimate.records import (
 from emb_bench.experiment.simulate import Trajectory
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Limits
 
-SLOW = 30.0  # Stribeck velocity with which friction at rest is suspected, where the plant has none [rad/s]
+SLOW = 30.0  # Stribeck velocity of the score test of static friction, for a plant without one [rad/s]
 SMALLEST = 1e-12  # Share of a period that counts, per unit of an effect; a sensitivity is divided by it
 SMALL = 1e-6  # Step of the finite differences of samples [rad, rad/s]
 
@@ -213,7 +213,7 @@ class Linearised:
         return self._sensitivities["k_m"]
 
     def time_scale(self, _: str) -> Floats:
-        """A faster clock: torques go with s⁻², as with a smaller J, but for f_v, which goes with s⁻¹."""
+        """A faster clock by the factor s: torques scale with s⁻², as with a smaller J, and that of f_v with s⁻¹."""
         return 2.0 * self._sensitivities["J"] + self._sensitivities["f_v"]
 
     def _small(self, shift: Floats) -> Floats:

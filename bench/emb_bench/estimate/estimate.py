@@ -84,7 +84,7 @@ class Estimate:
 
     @property
     def theta(self) -> BrakeParameters:
-        """The estimated brake; what is not among the unknowns is nominal."""
+        """The estimated brake; parameters without an estimate are nominal."""
         return self.problem.theta(self.z)
 
     @property

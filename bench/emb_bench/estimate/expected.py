@@ -125,7 +125,7 @@ def of_information(e: Information) -> Interval:
 
 
 def sampled(bench: Bench, plant: Plant, currents: Sequence[float] | Floats) -> Experiment:
-    """An experiment with planned currents [A] of which each sample is received, after a rest at the origin."""
+    """An experiment with planned currents [A], after rest at the origin, without lost samples."""
     experiment = planned(currents, plant.instruments.encoder_offset)
     rested = bench.noise.angle / math.sqrt(REST_SAMPLES)
     return replace(experiment, samples=np.zeros_like(experiment.samples), slack=rested)

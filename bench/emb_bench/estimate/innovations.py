@@ -11,8 +11,8 @@ The filter updates with one output of a sample after the other, which whitens th
 covariance does. A lost sample has no update. In a period without report the current has the bench's limit as standard
 deviation; its effect on a free inertia adds to the covariance.
 
-**Derivatives** of the innovations are taken with fixed gains: the update of the state's sensitivities is then exactly
-s ← (I − K H) s. The neglected derivatives of the gains multiply white noise.
+**Derivatives** of the innovations are taken with fixed gains: the update of the state's sensitivities is then exactly s
+← (I − K H) s. The neglected derivatives of the gains multiply white noise.
 
 Without disturbance, with a given start and with all reports the gains are zero, and the innovations are the residuals
 of output error.

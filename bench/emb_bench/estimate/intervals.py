@@ -1,4 +1,4 @@
-"""Rules by which an interval of an estimate is made, in the order in which they apply (docs/explanation/estimation.md).
+"""Rules for the interval of an estimate, in their order (docs/explanation/estimation.md).
 
 1. *The information*: a Gaussian interval with the covariance averaged over the presence of systematic errors.
 2. *Unmodelled effects*: their root mean square biases are added in quadrature.

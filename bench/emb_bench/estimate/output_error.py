@@ -272,10 +272,10 @@ def sandwich(
 ) -> Floats:
     """Sandwich covariance of an estimate: H⁻¹ (Σ g g^T) H⁻¹ with the scores g of the samples, shape (p, p).
 
-    Autocorrelated residuals widen it: scores are summed by Newey and West (1987), with Bartlett weights up to
-    4 (n/100)^(2/9) lags. Starts, priors and the information ``added`` to that of the Jacobian enter by their
-    information. ``errors``, shape (m,), has two residuals for each sample of experiments of these ``lengths``, then
-    those of starts and priors. The diagonal is inf for unknowns that the data do not identify.
+    Autocorrelated residuals widen it: scores are summed by Newey and West (1987), with Bartlett weights up to 4
+    (n/100)^(2/9) lags. Starts, priors and the information ``added`` to that of the Jacobian enter by their information.
+    ``errors``, shape (m,), has two residuals for each sample of experiments of these ``lengths``, then those of starts
+    and priors. The diagonal is inf for unknowns that the data do not identify.
     """
     scores, meat, used = jacobian * errors[:, None], np.zeros_like(information), 0
     for n in lengths:

@@ -38,7 +38,7 @@ NEAR_BOUND = 1e-6  # Share of the search range; nearer to its end an unknown is 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Experiments, a model and what is unknown.
+    """Experiments, a model and the unknowns.
 
     A search moves a vector z: the logarithm of each relative unknown, the others in their units. Derivatives to z are
     then the sensitivities themselves, θ ∂y/∂θ = ∂y/∂ln θ, and what is positive stays so.
@@ -308,7 +308,7 @@ class Problem:
         return np.concatenate([*residuals, of_priors]), np.concatenate([*rows, rows_of_priors])
 
     def rests(self) -> dict[int, list[int]]:
-        """Numbers of the experiments whose angle at rest is a measurement, and the elements of z that it depends on."""
+        """Experiments with a measured angle at rest, by number, and the elements of z that it depends on."""
         found = {}
         for i, experiment in enumerate(self.experiments):
             touched = [c for c in self.indices(i) if self.unknowns[c].name in ("x1_0", "offset")]

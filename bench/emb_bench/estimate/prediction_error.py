@@ -110,7 +110,7 @@ def _place(base: Filter, kind: str, power: float, near: Floats) -> _Place:
 
 
 def _roughly(base: Filter, kind: str, near: Floats) -> _Place:
-    """The likeliest power of ten of one kind of walk, the other kind as it is; from the strongest down."""
+    """The likeliest power of ten of one kind of walk, with the other kind fixed; from the strongest down."""
     places = []
     for power in POWERS[kind]:
         places.append(_place(base, kind, power, near))
@@ -119,7 +119,7 @@ def _roughly(base: Filter, kind: str, near: Floats) -> _Place:
 
 
 def _refined(base: Filter, kind: str, rough: _Place) -> _Place:
-    """The likeliest size of one kind of walk near a rough one, the other kind as it is."""
+    """The likeliest size of one kind of walk near a rough one, with the other kind fixed."""
     power = math.log10(getattr(rough.filter, kind) / strong(base.problem, kind))
     sought = minimize_scalar(
         lambda x: _place(base, kind, x, rough.z).deviance,

@@ -42,7 +42,7 @@ from emb_bench.sim.open_loop import march
 from emb_runtime.errors import UsageError
 
 SHORTEST = 10  # Fewest samples of a window
-AROUND = 8  # Samples on each side of a window's start from which its velocity is taken, where none is measured
+AROUND = 8  # Samples on each side of a window's start for its velocity, with an observer
 RESTARTS = 4  # Most restarts of a search from better starts of the windows
 RESTARTED = 1e-3  # Relative fall of the cost below which there is no further restart
 HALVINGS = 12  # Most halvings of a step of a window's start
@@ -359,7 +359,7 @@ def _spans(problem: Problem, number: int, length: int) -> Iterator[Span]:
 
 
 def _window(problem: Problem, span: Span) -> Experiment:
-    """One window; one that begins with lost samples starts from the last that was received.
+    """One window; after lost samples it starts from the last received one.
 
     An observer's velocity lags: a window starts with the slope of a parabola through the angles around its start
     instead. With too low a velocity it may stick where the machine moved, and the cost would have no gradient.

@@ -1,1 +1,1 @@
-"""The experiment inside a log: which current acted when, what was measured, and what a model makes of it."""
+"""The experiment in a log: applied currents and samples, and their simulation by a model."""

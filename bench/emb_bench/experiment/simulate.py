@@ -29,8 +29,8 @@ class SystematicErrors(NamedTuple):
     """Systematic errors of bench and sensors, beyond those that belong to the plant."""
 
     offset: float | None = None  # Reading of the encoder at the origin [rad]; None takes the plant's
-    current_offset: float = 0.0  # Current that acts beyond what the node reports [A]
-    delay: float = 0.0  # By which commands act late [samples], above -1 and below 1; below 0, samples are late
+    current_offset: float = 0.0  # Applied current less the reported one [A]
+    delay: float = 0.0  # Delay of commands [samples], above -1 and below 1; below 0 samples are late
     velocity_gain: float = 0.0  # Relative error of the velocity's scale
 
 
@@ -67,7 +67,7 @@ class Trajectory(NamedTuple):
     """Angle [rad] and velocity [rad/s] at the n + 1 instants that the samples y_0..y_n show, shape (n + 1, 2)."""
     samples: Floats  # Samples y_1..y_n: angle [rad] and velocity [rad/s], shape (n, 2)
     sensitivities: Floats
-    """Of the samples to the parameters, then to what is unknown in the gaps, shape (n, unknowns, 2).
+    """Of the samples to the parameters, then to the gap unknowns, shape (n, unknowns, 2).
 
     Relative for the brake's parameters, θ_i ∂y/∂θ_i at its θ (eq. 4.17); per unit for those in ``UNITS``, for the
     current of a single lost report [A], and for angle and velocity after a longer gap.
@@ -82,7 +82,7 @@ def simulate(
     params: Sequence[str] = (),
     loop: Callable[..., None] = march,
 ) -> Trajectory:
-    """Simulates an experiment of n periods of ``t_s`` [s]: what a plant's instruments show; limits are not applied.
+    """Simulates an experiment of n periods of ``t_s`` [s] with a plant's instruments; limits are not applied.
 
     ``params`` are any of ``PARAMETERS`` in any order; none gives the samples alone. ``loop`` is
     :func:`emb_bench.sim.open_loop.march`, as it is or compiled.

@@ -22,9 +22,9 @@ def read_theta(
 ) -> tuple[str, BrakeParameters, SystematicErrors]:
     """The name of the parameters to evaluate at, the parameters, and the systematic errors estimated with them.
 
-    They are values by name, ``name=value,name=value``, ``log`` for the last running estimate in the log, nothing for
-    that or nominal where there is none, ``nominal``, ``true``, or the JSON of an estimate or a report; the others are
-    nominal. Planned currents have no log, and neither ``log`` nor ``true``.
+    ``given`` is one of: values by name; a text ``name=value,name=value``; ``log`` for the last running estimate in the
+    log; ``nominal``; ``true``; the file of an estimate or a report. The default is ``log``, or ``nominal`` without a
+    running estimate. Parameters without a value are nominal. Planned currents have neither ``log`` nor ``true``.
     """
     if isinstance(given, Mapping):
         named = ",".join(f"{name}={value}" for name, value in given.items()) or "nominal"
@@ -52,7 +52,7 @@ def read_theta(
 
 
 def _running(log: RunLog, bench: Bench) -> dict[str, float]:
-    """The last running estimate in a log; empty without one, or where a value can be no brake's."""
+    """The last running estimate in a log; empty without one, or with an impossible value."""
     try:
         values = {name: float(entry["value"]) for name, entry in last_estimate(log).items() if name in PARAMETER_NAMES}
         for name, value in values.items():

@@ -9,8 +9,8 @@ D is log |M|, A is tr M⁻¹, E is λ_min (Atkinson, Donev and Tobias, Optimum E
 - :mod:`emb_bench.information.symmetric` for compiled loops over small matrices: the criteria and φ from a Cholesky
   factor.
 
-All φ are logarithms: a difference of 0.1 has the same weight for each criterion. Concavity gives the tangent bound
-φ(M) ≤ φ(M₀) + tr(∇φ(M₀) (M − M₀)), which the search uses.
+All φ are logarithms: a difference of 0.1 has the same weight for each criterion. Concavity gives the tangent bound φ(M)
+≤ φ(M₀) + tr(∇φ(M₀) (M − M₀)), which the search uses.
 """
 
 from __future__ import annotations

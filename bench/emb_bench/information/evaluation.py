@@ -50,7 +50,7 @@ class Fit:
 
     @property
     def compared(self) -> tuple[float, ...]:
-        """The distances of what is measured."""
+        """The distances of the measured outputs."""
         return (self.angle,) if self.velocity is None else (self.angle, self.velocity)
 
     @property
@@ -138,7 +138,7 @@ class Question:
         return tuple(n for n in self.names if p and getattr(p.low, n, 0.0) < getattr(p.high, n, 0.0))
 
     def start(self, theta: BrakeParameters) -> Floats | None:
-        """The prior's Fisher information, relative to ``theta``; zero for what does not vary in it."""
+        """The prior's Fisher information, relative to ``theta``; zero for parameters without a prior."""
         if self.prior is None:
             return None
         start = np.zeros((len(self.names), len(self.names)))
@@ -153,7 +153,7 @@ class Information:
 
     bench: Bench
     plant: Plant  # The model
-    theta: BrakeParameters  # Parameters at which the information was computed, and to which relative values refer
+    theta: BrakeParameters  # Parameters of the evaluation, and reference of relative values
     errors: SystematicErrors  # Given systematic errors
     question: Question
     experiment: Experiment | None  # None of several together
@@ -172,7 +172,7 @@ class Information:
 
     @property
     def title(self) -> str:
-        """Kind of information, and of what it is."""
+        """Kind and source of the information."""
         return f"Information of {'several runs' if self.experiment is None else 'planned currents'}"
 
     def __getitem__(self, name: str) -> float:
@@ -199,7 +199,7 @@ class Information:
 
     @property
     def covariance(self) -> Floats:
-        """Inverse of ``matrix``, the smallest possible covariance; inf on the diagonal of what is not identified."""
+        """Inverse of ``matrix``, the smallest possible covariance; inf on the diagonal if not identified."""
         return self.fisher("physical").covariance()
 
     cov = covariance  # As numpy calls it
@@ -265,7 +265,7 @@ class Evaluation(Information):
 
     @property
     def title(self) -> str:
-        """Kind of information, and of what it is."""
+        """Kind and source of the information."""
         return f"Evaluation of {self.log.path.name}"
 
 

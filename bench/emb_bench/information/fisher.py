@@ -57,10 +57,10 @@ def weights_of(bench: Bench, kind: Kind) -> Weights:
 def weights_along(bench: Bench, kind: Kind, instruments: Instruments, states: Floats) -> Floats:
     """The weights of each sample of a run, with the effects of the instruments.
 
-    An error σ_t of the instant of sampling adds to the variance of an output what the output changes in that time:
-    R_eff = σ² + (ẏ σ_t)², where the velocity is that of the sample and the acceleration the mean of the period before.
-    A velocity that an observer derives from the angles has no information besides theirs: its weight is zero. The
-    weighted information is the thesis's, without effects of the instruments.
+    An error σ_t of the instant of sampling adds the change of the output in that time to its variance: R_eff = σ² + (ẏ
+    σ_t)², with the velocity of the sample and the mean acceleration of the period before. A velocity that an observer
+    derives from the angles has no information besides theirs: its weight is zero. The weighted information is the
+    thesis's, without effects of the instruments.
 
     The states are those at all n + 1 instants; the weights, shape (n, 2), have the units of :class:`Weights`.
     """

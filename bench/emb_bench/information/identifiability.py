@@ -95,8 +95,8 @@ class Spectrum:
     def correlation(self) -> Floats:
         """Correlations of the estimates.
 
-        Between parameters that the data do not identify it is the limit for a prior that vanishes: that of the
-        flat directions they share, and 0 where they share none.
+        Between parameters that the data do not identify it is the limit for a prior that vanishes: that of the flat
+        directions they share, and 0 where they share none.
         """
         covariance = (self._vectors / self._values) @ self._vectors.T
         flat = self._flat.T @ np.linalg.pinv(self._flat.T)

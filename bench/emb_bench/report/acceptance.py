@@ -64,7 +64,7 @@ class Budgets(msgspec.Struct, frozen=True):
 class Criteria(msgspec.Struct, frozen=True):
     """Content of an acceptance file."""
 
-    model_fit: bool = True  # The model has to fit the records, and to predict what it was not fitted to
+    model_fit: bool = True  # The model has to fit the records, and to predict held-out ones
     parameters: dict[str, Tolerance] = {}
     drift: dict[str, Positive] = {}
     """Largest allowed change since an earlier estimate, by parameter: relative, or in the parameter's unit."""

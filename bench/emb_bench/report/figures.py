@@ -144,7 +144,7 @@ def _spans(time: Floats, where: Any, period: float) -> list[tuple[float, float]]
 
 
 def angle_and_velocity(motion: Motion) -> list[Panel]:
-    """Measured angle and velocity, and what the model predicts at the estimate, with the bench's limits."""
+    """Measured angle and velocity, the prediction at the estimate, and the bench's limits."""
     limits, period, cycles, after = motion.bench.limits, motion.bench.timing.sample_time, motion.cycles, motion.after
     if motion.experiment is None:
         if cycles is None:

@@ -25,12 +25,12 @@ REASONS = {
     Reason.MISSED: "no sample in time, nothing sent",
     Reason.LEFT: "the needed current is beyond slew or limit: the node brakes",
 }
-"""Reasons for which the sent current differs from the one that the policy requested, in words."""
+"""Reasons for a difference between sent and requested current, in words."""
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Motion of the brake in a run, and what drove it."""
+    """Motion and currents of the brake in a run."""
 
     run: StudiedRun
     bench: Bench

@@ -22,7 +22,7 @@ from emb_runtime.system.terminal import escaped
 LONGEST = 2000  # Characters of a text from a log that are shown; report.json has them all
 
 Words = str | Sequence[str]
-"""A text, or parts of one of which some are cells that stand out."""
+"""A text, or its parts, of which cells have a style."""
 
 
 class Panel(NamedTuple):
@@ -58,7 +58,7 @@ class Items:
 
 @dataclass(frozen=True)
 class Facts:
-    """Names, and what each is: words, or blocks."""
+    """Rows of a name with words or blocks."""
 
     kind: ClassVar[str] = "facts"
     rows: Sequence[tuple[str, Words | Sequence[Block]]]
@@ -67,7 +67,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Figures:
-    """Figures with a caption; one that is wide has a row for itself."""
+    """Figures with a caption; wide ones take a row each."""
 
     kind: ClassVar[str] = "figures"
     panels: Sequence[Panel]
@@ -77,7 +77,7 @@ class Figures:
 
 @dataclass(frozen=True)
 class Section:
-    """A part with a heading; one that is folded is opened by it."""
+    """A part with a heading, which opens a folded one."""
 
     kind: ClassVar[str] = "section"
     name: str  # Its address on the page
@@ -119,7 +119,7 @@ class Page:
 
 
 def html(page: Page) -> str:
-    """The page as HTML: the verdict first, then what it rests on; evidence is folded."""
+    """The page as HTML: the verdict, then its reasons; evidence is folded."""
     css = resources.files("emb_bench.report").joinpath("page.css").read_text(encoding="utf-8")
     return environment().get_template("page.html.j2").render(page=page, css=Markup(css))
 
@@ -138,7 +138,7 @@ def environment() -> Environment:
 
 
 def code(text: str) -> Words:
-    """Text from a log as it is there, cut where it is long."""
+    """Unchanged text from a log, cut at ``LONGEST``."""
     more = len(text) - LONGEST
     return [Cell(text[:LONGEST], "code"), f" … {more} further characters" if more > 0 else ""] if text else "–"
 

@@ -228,7 +228,7 @@ def models(study: Study) -> str:
 
 
 def limit(effect: Contribution, e: Estimate) -> str:
-    """Effect that limits an interval most, with the prior of one that all runs share."""
+    """Largest effect of an interval; one that all runs share with its prior."""
     name, shared = shown_as(effect, e.bench.machine).name, effect.name in OF_THE_BENCH
     return f"{name}, known to {in_percent(e.question.unmodelled[effect.name])}" if shared else name
 
@@ -274,7 +274,7 @@ def alarms(e: Estimate) -> list[str]:
 
 
 def _cause(cause: Cause, e: Estimate) -> str:
-    """The effect that explains a misfit, or most of it, and what else to look for."""
+    """The cause of a misfit with its remedy, and the advice to check the data for an impossible amount."""
     sentence = explained(cause, e.bench.machine)
     sentence += _window(e) if "--nuisance" in sentence else ""
     return sentence if cause.possible else f"{sentence}; or look for a fault in the data"

@@ -57,8 +57,8 @@ def reading(x1: Any, x2: Any, acceleration: Any, late: Any, offset: float, veloc
 
     The brake goes on as it went through the period: the angle is right to second order and the velocity to first. The
     error is late²/2 respectively late times the difference between the mean acceleration of the period [rad/s²] and the
-    one at its end, for 20 µs at most 6e-6 rad and 0.6 rad/s, where full braking ends in standstill. Nothing reaches the
-    brake before the sample is out, so that there is no other current to be seen.
+    one at its end, for 20 µs at most 6e-6 rad and 0.6 rad/s, where full braking ends in standstill. No new command can
+    act before the sample is sent.
 
     The encoder shows ``offset`` [rad] at the origin, and the velocity's scale is ``velocity_scale``.
     """
@@ -66,7 +66,7 @@ def reading(x1: Any, x2: Any, acceleration: Any, late: Any, offset: float, veloc
 
 
 def sensor_share(unknown: int, output: int, shown: Any) -> Any:
-    """Derivative of a reading to an unknown of the sensors, per unit; 0 to any other.
+    """Derivative of a reading to an unknown of the sensors, per unit; 0 for others.
 
     ``output`` is 0 for the angle, 1 for the velocity; ``shown`` is the reading with the right scale.
     """

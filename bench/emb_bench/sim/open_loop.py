@@ -1,14 +1,13 @@
 """Open loop: a brake driven through a record of currents, with the sensitivities of its state.
 
-:func:`march` is the one loop over a record, compiled or as it is; what instruments show of its motion is
-:mod:`emb_bench.experiment.simulate`. Loops that need the state between two periods, because a filter corrects it or a
-current answers it, are :mod:`emb_bench.estimate.innovations` on :func:`advance_shares`, and :func:`feedback` in plain
-Python.
+:func:`march` is the loop over a record, compiled or in plain Python; :mod:`emb_bench.experiment.simulate` adds the
+instruments. Other loops need the state between two periods: the filter of :mod:`emb_bench.estimate.innovations` on
+:func:`advance_shares`, and :func:`feedback` in plain Python.
 
 **Which samples count.** A sequence of n currents u_0..u_{n−1} moves the brake from the state x_0 to x_n, and the
 samples y_1..y_n after each period count. y_0 has no information on a brake with a given initial state (eq. 4.26).
 
-**Late switching.** A command that acts ``late`` periods after it was due leaves the one before it in force until then.
+**Late switching.** The command before acts for the first ``late`` part of a period.
 
 Plain Python on the base install: 500 samples with four parameters take 3 ms on the Euler brake, 16 ms on the exact one.
 """
@@ -225,7 +224,7 @@ def feedback(
 
 
 def fast_loop(periods: int) -> Callable[..., None]:
-    """Returns :func:`march`, compiled where that pays for so many periods, or has been done; equal results."""
+    """Returns :func:`march`, compiled if that saves time for so many periods; the results are equal."""
     if periods < WORTH_COMPILING and "numba" not in sys.modules:
         return march
     from emb_bench.compiled import compiled

@@ -1,8 +1,8 @@
 """The simulated brake: one sample period of the closed loop, a brake behind a device, and its command-line options.
 
-A measurement is answered, the brake moves, the next sample is measured: the node and every experiment of a training go
-through :func:`sent_current` and :func:`pass_period`. They are plain scalar Python; compiled by
-:func:`emb_bench.compiled.compiled` they are what the batch runs, bit for bit.
+The node and every experiment of a training use :func:`sent_current` for the current of a measurement, and
+:func:`pass_period` for the motion and the next measurement. They are plain scalar Python; the batch runs them compiled
+by :func:`emb_bench.compiled.compiled`, with the same bits.
 """
 
 from __future__ import annotations
@@ -164,7 +164,7 @@ def true_parameters(
 
 
 def check_near_nominal(bench: Bench, name: str, value: float, where: str = "", got: str = "") -> None:
-    """Refuse a parameter that must be a typing error: a brake that fast would take for ever to simulate."""
+    """Refuse a parameter that must be a typing error: so fast a brake would take very long to simulate."""
     nominal = getattr(bench.brake, name)
     low, high = nominal / FARTHEST, nominal * FARTHEST
     if not low <= value <= high:  # this way round, NaN is refused
@@ -191,8 +191,8 @@ def read_brake(text: str, bench: Bench, option: str) -> BrakeToSimulate:
     """Reads ``plant=exact,seed=3,f_v=3e-5``; what is not given is the default plant, seed 1, nominal.
 
     ``charge=1`` has the node send the integral of its current; ``angle_noise`` [rad] and ``velocity_noise`` [rad/s] are
-    standard deviations of sensors that differ from the bench file. ``temperature`` [degC] with ``supply_voltage``
-    [V] has the node send them. ``option`` begins a message.
+    standard deviations of sensors that differ from the bench file. ``temperature`` [degC] with ``supply_voltage`` [V]
+    has the node send them. ``option`` begins a message.
     """
     return brake_of(parse_assignments(text, option), bench, option)
 

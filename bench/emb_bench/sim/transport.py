@@ -1,6 +1,6 @@
 """``--iface sim``: the node in lock-step with simulated time. Deterministic, faster than real time, no CAN needed.
 
-Time moves only while the runtime waits for a frame, so that whatever it computes takes no time on this bus.
+Time advances only while the runtime waits for a frame: its computations take no time on this bus.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from emb_runtime.records import Frame
 
 
 class SteppedClock:
-    """Simulated time: stands still until somebody moves it on."""
+    """Simulated time: stands still until it is set."""
 
     def __init__(self, start_ns: int = 0, wall_offset_ns: int = 0) -> None:
         self._now_ns = start_ns
