@@ -154,8 +154,7 @@ def predict(model: Model, state: State, periods: float, applied: float) -> tuple
     if periods <= 0.0:
         return mean, p
     by_k1, by_tc, by_fv = model.spring, model.coulomb, model.viscous
-    t, gaps = periods * model.sample_time, periods - 1.0
-    lost = (0.0 if gaps < 0.0 else gaps) * model.lost
+    t, lost = periods * model.sample_time, max(periods - 1.0, 0.0) * model.lost
     x, v, km, k1, tc, fv = mean
     p00, p01, _, p03, p04, _, p11, p12, p13, p14, p15, _, _, p24, _, p33, p34, _, p44, p45, p55 = p
     driving, by_friction, pressed = model.motor * applied, t * by_tc, 0.0 if x < 0.0 else x

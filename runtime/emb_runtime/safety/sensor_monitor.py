@@ -122,8 +122,7 @@ def judge(
         return state, CONTRADICTING
     x, v, travel, up_from, down_from, motion, opposed, lows, highs, flowing, obeys, confirmed = state
     share = elapsed / law.sample_time
-    periods = round(share)
-    periods = 1 if periods < 1 else periods
+    periods = max(round(share), 1)
     travelled, expected = angle - x, 0.5 * elapsed * (velocity + v)
     slack = limits.offset * elapsed
     if periods > 1:  # between them the velocity lies within a triangle of the greatest acceleration, up or down
