@@ -67,7 +67,8 @@ def results(bench: Bench, quick: bool, declared: float, true: float, count: int,
         out[batch.experiments.violated, LEFT] = 1.0
     for row, loop in zip(out, batch.experiments.loops, strict=True):
         state = loop.estimate
-        row[:FITS] = *believed(batch.setup.model, state), *deviations(batch.setup.model, state)
+        relative = believed(batch.setup.model, state)
+        row[:FITS] = *relative, *deviations(batch.setup.model, state, relative)
         row[FITS], row[WORST] = fits(state), state.worst
     truths = [[getattr(d.brake, name) / getattr(bench.brake, name) for name in PARAMETER_NAMES] for d in draws]
     return np.array(truths), out

@@ -293,7 +293,7 @@ def _estimator(dice: random.Random) -> Iterator[Any]:
             state = kalman.follow(model, state, *seen, float(step), current)
             believed = kalman.believed(model, state)
             wanted = speed_loop.current_for(model, state, believed, dice.uniform(-500.0, 500.0), gain)
-            yield state, believed, kalman.deviations(model, state), wanted
+            yield state, believed, kalman.deviations(model, state, believed), wanted
             current = dice.uniform(-6.0, 6.0)
             push = model.motor * current - model.spring * max(angle, 0.0) - model.viscous * velocity
             angle += 1e-3 * velocity
