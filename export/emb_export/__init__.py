@@ -5,6 +5,6 @@ from __future__ import annotations
 
 def emb_export() -> int:
     """Currents or a network as a policy for emb-run; imported after the first handler of a Ctrl-C."""
-    from emb_runtime.system.entry import start  # this package is also a library
+    from emb_runtime.system.entry import run_command  # this package is also a library
 
-    return start("emb_export.export", "emb-export: interrupted, nothing written")
+    return run_command("emb_export.export", "emb-export: interrupted, nothing written")

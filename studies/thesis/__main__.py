@@ -2,6 +2,6 @@
 
 import sys
 
-from emb_runtime.system.entry import start
+from emb_runtime.system.entry import run_command
 
-sys.exit(start("studies.thesis.cli", "python -m studies.thesis: interrupted"))
+sys.exit(run_command("studies.thesis.cli", "python -m studies.thesis: interrupted"))

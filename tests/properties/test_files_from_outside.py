@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from emb_runtime.can.messages import load_layout
-from emb_runtime.system.entry import start
+from emb_runtime.system.entry import run_command
 from emb_runtime.system.input_file import _Regular
 from tests.bench.simulated_logs import square, write_log
 from tests.conftest import Simulate
@@ -80,7 +80,7 @@ def test_whatever_the_path_leads_to_one_line_says_so(
     monkeypatch.setattr("sys.argv", [program, *arguments])
     before = sorted(Path().iterdir())
     try:
-        code = start(PROGRAMS[program], "")
+        code = run_command(PROGRAMS[program], "")
     except SystemExit as ended:
         code = int(ended.code or 0)
     said = capsys.readouterr().err

@@ -7,9 +7,9 @@ import sys
 
 def emb_train() -> int:
     """Training of an excitation, and its evaluation; imported after the first handler of a Ctrl-C."""
-    from emb_runtime.system.entry import start  # this package is also a library
+    from emb_runtime.system.entry import run_command  # this package is also a library
 
-    return start("emb_train.cli", "emb-train: interrupted")
+    return run_command("emb_train.cli", "emb-train: interrupted")
 
 
 def register_environments() -> None:

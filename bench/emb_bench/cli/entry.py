@@ -8,19 +8,19 @@ import sys
 
 from emb_bench import ONE_THREAD
 from emb_runtime.errors import EXIT_DONE, UsageError
-from emb_runtime.system.entry import start
+from emb_runtime.system.entry import run_command
 
 GARBAGE = 100_000  # New objects after which Python looks for garbage
 
 
 def emb_node() -> int:
     """The simulated brake as a node on a CAN bus; Ctrl-C is how it is ended."""
-    return start("emb_bench.cli.node", "", EXIT_DONE)
+    return run_command("emb_bench.cli.node", "", EXIT_DONE)
 
 
 def emb_replay() -> int:
     """Evaluation of logs: estimate, report, Fisher information, export."""
-    return start("emb_bench.cli.replay", "emb-replay: interrupted", prepare=_for_short_work)
+    return run_command("emb_bench.cli.replay", "emb-replay: interrupted", prepare=_for_short_work)
 
 
 def _for_short_work() -> None:
@@ -36,7 +36,7 @@ def _for_short_work() -> None:
 def emb_commission() -> int:
     """An unknown brake, from a data sheet to a bench file."""
     message = "emb-commission: interrupted while a log was examined; the same command goes on from there"
-    return start("emb_bench.cli.commission", message, prepare=_for_short_work)
+    return run_command("emb_bench.cli.commission", message, prepare=_for_short_work)
 
 
 def emb_hil() -> int:
@@ -45,9 +45,9 @@ def emb_hil() -> int:
         from emb_runtime.system.terminal import complain
 
         return complain("emb-hil", UsageError("needs Linux, whose kernels it starts; emb-run --iface sim runs here"))
-    return start("emb_bench.hil.cli", "emb-hil: interrupted")
+    return run_command("emb_bench.hil.cli", "emb-hil: interrupted")
 
 
 def emb_design() -> int:
     """The current sequence with most information about known parameters."""
-    return start("emb_bench.cli.design", "emb-design: interrupted, nothing written")
+    return run_command("emb_bench.cli.design", "emb-design: interrupted, nothing written")

@@ -138,7 +138,7 @@ def live_view(plan: Plan, stop_requested: Callable[[], bool]) -> Iterator[None]:
             while child.alive and not stop_requested():
                 time.sleep(LISTEN_NS * 1e-9)
     finally:
-        child.end()
+        child.join()
 
 
 def _open(page: str) -> None:

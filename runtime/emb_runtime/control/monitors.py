@@ -162,8 +162,8 @@ class Sensors:
     def check_balance(self) -> None:
         """Check the motion of a whole experiment."""
         self.update_balance()
-        self.unexplained = self._balance.judge()
-        self._balance.judge_zero()
+        self.unexplained = self._balance.check_motion()
+        self._balance.check_origin()
 
     def warm_up(self, sample: SensorSample, limit: float) -> None:
         """Warm-up: run one dummy cycle, which :meth:`begin_run` forgets."""
@@ -176,7 +176,7 @@ class Sensors:
             self.response.add_sample(sample, True, 0.0)
         self._balance.begin_run(sample)
         self._balance.take(sample, True)
-        self._balance.judge()
+        self._balance.check_motion()
 
     @property
     def law(self) -> ShieldLaw:

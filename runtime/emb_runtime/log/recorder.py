@@ -54,7 +54,7 @@ class _WriterHere:
     def read_answer(self, _timeout: float) -> dict[str, Any]:
         return self._answer
 
-    def end(self) -> None:
+    def join(self) -> None:
         pass
 
 
@@ -118,7 +118,7 @@ class Recorder:
             self._child.tell(trailer)
         answer = self._child.read_answer(timeout + self._size / READ_BACK)
         lost = self._ring.dropped + int(answer.get("lost", len(self._ring)))
-        self._child.end()
+        self._child.join()
         self._ring.close()
         error = str(answer.get("error", ""))
         if not error and lost:

@@ -338,9 +338,9 @@ class MotionBalance:
         """Take in one more sample, as :func:`take`; raises StopError if the motion so far has no explanation."""
         self._state = take(self._model, self._state, follows, sample.angle, sample.velocity, sample.applied_current)
         if self._state.samples == 0:
-            self.judge()
+            self.check_motion()
 
-    def judge(self) -> tuple[float, float]:
+    def check_motion(self) -> tuple[float, float]:
         """Unexplained velocity and what is allowed, infinite where nothing is judged [rad/s].
 
         Raises StopError if it is more than that.
@@ -353,7 +353,7 @@ class MotionBalance:
             )
         return found, most
 
-    def judge_zero(self) -> None:
+    def check_origin(self) -> None:
         """Raise StopError if the spring, at the end of a run, does not begin at the zero of the angle."""
         place, most = origin(self._model, self._state)
         _, allowed = unexplained(self._model, self._state)

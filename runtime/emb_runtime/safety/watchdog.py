@@ -103,6 +103,6 @@ class WatchdogHandle:
         """
         self._child.release()
         answer = self._child.read_answer(timeout)
-        self._child.end()
+        self._child.join()
         self.pulse.close()
         return WatchdogResult(**answer, realtime=self.realtime)

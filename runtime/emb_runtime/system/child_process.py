@@ -116,14 +116,14 @@ class Child:
         """End it at once, unless it has ended."""
         self._process.kill()
         self._process.wait()
-        self.end()
+        self.join()
 
     def release(self) -> None:
         """Close its standard input: it may end now."""
         assert self._process.stdin is not None
         self._process.stdin.close()
 
-    def end(self) -> None:
+    def join(self) -> None:
         """Wait until it has ended, and kill it if it does not."""
         for pipe in (self._process.stdin, self._process.stdout):
             assert pipe is not None

@@ -22,7 +22,7 @@ if TAKEN:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def start(
+def run_command(
     module: str,
     message: str,
     interrupted: int = EXIT_INTERRUPTED,
@@ -119,13 +119,13 @@ def _flush() -> None:
 
 def emb_gateway() -> int:
     """A drive with another protocol as a node of emb-run; until it opens anything, Ctrl-C just ends it."""
-    return start("emb_runtime.cli.gateway", "", takes_signals=True)
+    return run_command("emb_runtime.cli.gateway", "", takes_signals=True)
 
 
 def emb_run() -> int:
     """One guarded experiment on a brake, logged; until it opens anything, Ctrl-C just ends it."""
     try:
-        return start("emb_runtime.cli.main", "", prepare=_choose_core, takes_signals=True)
+        return run_command("emb_runtime.cli.main", "", prepare=_choose_core, takes_signals=True)
     except UsageError as err:
         from emb_runtime.system.terminal import complain
 

@@ -402,7 +402,7 @@ class Waiting:
         self.waited = timeout
         return {}
 
-    def end(self) -> None: ...
+    def join(self) -> None: ...
 
 
 def test_a_day_of_listening_is_waited_for_while_it_is_read_back(tmp_path: Path) -> None:

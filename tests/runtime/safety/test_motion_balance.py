@@ -272,7 +272,7 @@ def test_an_honest_run_is_explained_and_a_gain_that_changes_ends_it_with_the_nex
     balance, first, rows = MotionBalance(BENCH), *split(honest)
     balance.begin_run(first)
     feed(balance, rows)
-    found, most = balance.judge()
+    found, most = balance.check_motion()
     reference = Reference(BENCH, honest)
     assert found == pytest.approx(reference.unexplained([*range(20, 501, 20)]), rel=1e-7)
     assert most == pytest.approx(reference.allowed(), rel=1e-7)
@@ -288,7 +288,7 @@ def test_an_honest_run_is_explained_and_a_gain_that_changes_ends_it_with_the_nex
     said = [float(word) for word in stopped.value.detail.split() if word.isdigit()]
     assert said[0] > said[1] > 25.0
     balance.begin_run(first)
-    assert balance.judge() == (0.0, math.inf)
+    assert balance.check_motion() == (0.0, math.inf)
 
 
 def split(rows: list[Row]) -> tuple[SensorSample, Iterator[Row]]:
@@ -395,10 +395,10 @@ def run(bench: Bench, zero: float, seed: int = 1, samples: int = 500) -> MotionB
 @of_each_bench
 def test_a_zero_that_is_wrong_by_6_rad_is_found_and_one_by_less_than_is_allowed_is_not(bench: Bench) -> None:
     for zero in (0.0, 1.0, -1.0):
-        run(bench, zero).judge_zero()
+        run(bench, zero).check_origin()
     for zero in (6.0, -6.0):
         with pytest.raises(StopError) as stopped:
-            run(bench, zero).judge_zero()
+            run(bench, zero).check_origin()
         assert stopped.value.fault is Fault.MOTION_UNEXPLAINED
         place = float(stopped.value.detail.split("begins at ")[1].split()[0])
         assert place == pytest.approx(-zero, abs=2.0)  # of the nominal spring, whose begin is an edge
@@ -406,13 +406,13 @@ def test_a_zero_that_is_wrong_by_6_rad_is_found_and_one_by_less_than_is_allowed_
 
 def test_what_is_not_judged_by_the_balance_has_no_origin_to_judge(bench: Bench) -> None:
     lagging = replace(bench, shield=bench.shield._replace(current_lag=0.0005))
-    run(lagging, 6.0).judge_zero()
+    run(lagging, 6.0).check_origin()
     few = MotionBalance(bench)
     few.begin_run(sample(Row(True, 0.0, 0.0, 0.0)))
-    few.judge_zero()
+    few.check_origin()
 
 
 def test_the_origin_may_be_as_far_off_as_is_allowed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     balance = run(bench, 0.0)
     monkeypatch.setattr(motion_balance, "origin", lambda *_: (3.0, 3.0))
-    balance.judge_zero()
+    balance.check_origin()

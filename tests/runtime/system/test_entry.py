@@ -108,7 +108,7 @@ def main():
 @pytest.mark.parametrize("command", [LOST, MISTAKEN], ids=["dropped in a destructor", "made another error"])
 def test_a_ctrl_c_that_a_library_takes_ends_the_command_all_the_same(tmp_path: Path, command: str) -> None:
     (tmp_path / "command.py").write_text(command)
-    code = "import sys; from emb_runtime.system.entry import start; sys.exit(start('command', 'interrupted'))"
+    code = "import sys; from emb_runtime.system import entry; sys.exit(entry.run_command('command', 'interrupted'))"
     paths = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's job in the background ignores it
     done = subprocess.run(

@@ -117,7 +117,7 @@ def main():
 
 def started(folder: Path, text: str, encoding: str, **streams: Any) -> subprocess.CompletedProcess[bytes]:
     (folder / "command.py").write_text(text, encoding="utf-8")
-    code = "import sys; from emb_runtime.system.entry import start; sys.exit(start('command', 'interrupted'))"
+    code = "import sys; from emb_runtime.system import entry; sys.exit(entry.run_command('command', 'interrupted'))"
     paths = os.pathsep.join([str(folder), *filter(None, sys.path)])
     environment = os.environ | {"PYTHONIOENCODING": encoding, "PYTHONPATH": paths}
     ran: subprocess.CompletedProcess[bytes] = subprocess.run(
