@@ -30,11 +30,11 @@ def _table() -> bytes:
 CRC_TABLE: Final = _table()
 
 
-def _advance(state: int, data: bytes) -> int:
-    table = CRC_TABLE
+def crc(start: int, data: bytes) -> int:
+    """The CRC register after some bytes; ``start`` is its value before them."""
     for byte in data:
-        state = table[state ^ byte]
-    return state
+        start = CRC_TABLE[start ^ byte]
+    return start
 
 
 def profile1_start(data_id: int) -> int:
@@ -42,17 +42,12 @@ def profile1_start(data_id: int) -> int:
 
     Profile 1 of release 4 undoes the start value and the final XOR of the standard CRC, so that both are zero.
     """
-    return _advance(0x00, data_id.to_bytes(2, "little"))
-
-
-def protect(start: int, body: bytes) -> bytes:
-    """The CRC byte followed by the body: payload bytes 1 and up; ``start`` is that of the message's data id."""
-    return bytes((_advance(start, body),)) + body
+    return crc(0x00, data_id.to_bytes(2, "little"))
 
 
 def has_valid_crc(start: int, payload: bytes) -> bool:
-    """Returns True if byte 0 of a payload (at least 1 byte) is the CRC of the other bytes."""
-    return payload[0] == _advance(start, payload[1:])
+    """Returns True if byte 0 of a payload (at least 1 byte) is the CRC of the others; ``start`` is the data id's."""
+    return payload[0] == crc(start, payload[1:])
 
 
 def next_counter(counter: int) -> int:

@@ -125,7 +125,7 @@ class Protection:
         first = min(field.positions) // 8
         rest = data[:first] + data[first + field.length // 8 :]
         if self.kind == "profile1":
-            return e2e.protect(e2e.profile1_start(self.data_ids[0]), rest)[0]
+            return e2e.crc(e2e.profile1_start(self.data_ids[0]), rest)
         if self.kind == "profile2":
             assert self.counter is not None
             data_id = self.data_ids[raw_value(self.counter, data) % len(self.data_ids)]
