@@ -45,9 +45,7 @@ def evaluate_one(source: Source, options: CampaignOptions, bench: Bench | None =
             row |= found
     except EmbError as err:
         return row | {"error": failed(source, str(err))["error"]}
-    except (
-        Exception
-    ) as err:  # one log must not end the campaign; a fault of the program is reported like one of the log
+    except Exception as err:  # one log must not end the campaign: a fault of the program counts as one of the log
         return row | {"error": failed(source, f"{source.path}: {type(err).__name__}: {err}")["error"]}
     return row | {"error": None}
 

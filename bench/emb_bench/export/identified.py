@@ -53,7 +53,7 @@ ABOUT: Mapping[str, str] = {
     "x2_0": "velocity at the start",
 }
 """Parameters of an exported brake."""
-LARGEST = 1.0 / SMALLEST  # Of a number in a bench file
+LARGEST = 1e30  # Of a number in a bench file
 CHOSEN = ("x1_0", "x2_0", "tolerance")  # What is of a simulation, not of the brake
 UNITS = SI | {"gamma": "m", "stribeck_exponent": "1", "hysteresis_travel": "rad", "tolerance": "rad/s"}
 _HINTS = get_type_hints(BrakeParameters, include_extras=True) | get_type_hints(Mechanics, include_extras=True)

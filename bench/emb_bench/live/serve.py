@@ -38,9 +38,7 @@ SUBSCRIBING = 0.1  # Time for viewers to subscribe to new topics before their fi
 LINGER = 0.2  # Time for viewers to get the last messages [s]
 BACKLOG = 1 << 14  # Messages that wait for a slow viewer; a chunk has about a thousand. Then the oldest are dropped.
 MOST_WAITING = 32 << 20  # Size of them [bytes]
-MOST_TEXTS = (
-    1000  # Texts that wait for a slow viewer; with more it is closed. A page that comes late gets ``KEPT`` at once
-)
+MOST_TEXTS = 1000  # Texts that wait for a slow viewer, a late page's ``KEPT`` among them; with more it is closed
 MOST_VIEWERS = 16
 LARGEST_REQUEST = 64 << 10  # [bytes]
 OPENING, CLOSING = 2.0, 0.5  # Longest handshakes [s]

@@ -350,7 +350,7 @@ def _coloured(m: ModelValidation) -> str:
 def explained(cause: Cause, machine: Machine | None = None) -> str:
     """A cause with its remedy; ``machine`` is that of a bench without a brake.
 
-    With the amount only if the effect explains the misfit: a linear score test does not size others.
+    Without the amount if the effect explains a part only, or if χ² gives no alarm: a linear score test is poor there.
     """
     s = cause.suspect
     if s.observer:

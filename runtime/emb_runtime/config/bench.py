@@ -111,7 +111,7 @@ class Sensors:
     observer_bandwidth: Bandwidth | None = None
     """Least bandwidth of an observer of second order with a damping from 0.7 to 1 [rad/s]"""
     velocity_lag: Lag | None = None
-    """Longest lag of any other observer [s]"""
+    """Longest lag of an observer that no bandwidth describes [s]"""
 
     @property
     def bandwidth(self) -> float | None:
