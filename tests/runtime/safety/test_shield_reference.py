@@ -17,7 +17,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_runtime.records import Reason
-from emb_runtime.safety.shield import LIMITED, NO_PAST, RETURNING, Past, _accelerated, shield, successor, window
+from emb_runtime.safety.shield import (
+    LIMITED,
+    NO_PAST,
+    RETURNING,
+    Past,
+    _accelerated,
+    _unseen,
+    shield,
+    successor,
+    window,
+)
 from emb_runtime.safety.shield_design import CREEPS, VELOCITY_PAD, ShieldLaw, make_law
 from tests.benches import SENSOR_BENCH
 from tests.laws import with_numbers
@@ -329,6 +339,26 @@ def test_a_brake_at_rest_may_be_pushed_by_its_friction_the_next_moment() -> None
         _, _, _, up = _accelerated(law, -1.0, -1.0, slow, slow, 2.0)
         _, _, down, _ = _accelerated(law, -1.0, -1.0, -slow, -slow, -2.0)
         assert up == down == pytest.approx(2.0 * law.box.motor_high + gained, rel=1e-14)
+
+
+def test_the_weakest_motor_brakes_least() -> None:
+    law = drawn_law(Random(13))
+    braked = -1.0 * law.box.motor_low - law.box.friction_low - law.box.viscous_low * 200.0
+    _, up, _, obeyed_up = _accelerated(law, -5.0, -5.0, 200.0, 200.0, -1.0)
+    down, _, obeyed_down, _ = _accelerated(law, -5.0, -5.0, -200.0, -200.0, 1.0)
+    assert [up, obeyed_up, down, obeyed_down] == pytest.approx([braked] * 4, rel=1e-14)
+
+
+def test_what_drives_a_little_counts_and_what_brakes_does_not() -> None:
+    brake = {"motor": 2000.0, "spring": 0.0, "friction": 1000.0, "viscous": 0.0}
+    same = {f"{name}_{end}": value for name, value in brake.items() for end in ("low", "high")}
+    law = with_numbers(drawn_law(Random(5)), observer=1.5, change=10.0, damping_velocity=math.inf, **same)
+    blind, counts = law.delay.hidden.before[0] * law.change, law.sample_time * sum(law.delay.hidden.periods)
+    for sign, gained in itertools.product((1.0, -1.0), (0.5, -0.5)):
+        own = sign * (1000.0 + gained) / 2000.0
+        fallen, risen, fell, rose = _unseen(law, 0.0, 0.0, 400.0 * sign, 400.0 * sign, (own,) * 5, 0)
+        found = (risen, rose) if sign > 0.0 else (-fallen, -fell)
+        assert found == pytest.approx([blind + counts * max(gained, 0.0)] * 2, rel=1e-12)
 
 
 def drawn_past(rng: Random, law: ShieldLaw) -> Past:
