@@ -22,6 +22,7 @@ from emb_runtime.safety.shield import (
     NO_PAST,
     RETURNING,
     Past,
+    States,
     _accelerated,
     _unseen,
     shield,
@@ -32,7 +33,7 @@ from emb_runtime.safety.shield_design import CREEPS, VELOCITY_PAD, ShieldLaw, ma
 from tests.benches import SENSOR_BENCH
 from tests.laws import with_numbers
 
-Box = tuple[float, float, float, float]
+Box = States
 SHIPPED = make_law(SENSOR_BENCH)
 SEEDS = range(10)
 STATES = 80
