@@ -40,7 +40,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return found
 
 
-@pytest.mark.parametrize("command", STARTING)
+SLOW = [pytest.param(command, marks=pytest.mark.slow) for command in STARTING if "--ray" in command]
+
+
+@pytest.mark.parametrize("command", [*(command for command in STARTING if "--ray" not in command), *SLOW])
 def test_no_process_runs_a_module_of_the_working_directory(command: str, folder: Path) -> None:
     name, *arguments = command.split()
     (folder / "ran").unlink(missing_ok=True)

@@ -298,6 +298,16 @@ def test_without_a_shield_an_action_is_clipped_and_leaving_the_limits_ends_the_e
         assert np.isfinite(reward)
 
 
+def test_an_actor_that_is_told_everything_sees_what_the_critic_sees_without_the_sensitivities() -> None:
+    for parameters, size in ((("f_v",), 5), (("k_1", "f_v"), 8)):
+        env = EmbExcitationEnv(bench=BENCH, parameters=parameters, reward=trace_increment, conditions=OPEN)
+        seen, _ = env.reset(seed=0)
+        for _ in range(20):
+            seen, _, _, _, info = env.step(np.full(1, 0.8, np.float32))
+        assert seen.shape == env.observation_space.shape == (size,)
+        np.testing.assert_array_equal(seen, info["critic"][:size])
+
+
 # Returns of two experiments, as they were when the shipped actors were trained: where one changes, a training with the
 # same seed gives another actor
 RETURNS = {

@@ -290,10 +290,10 @@ def test_a_training_for_speeds_is_evaluated_as_the_runtime_plays_its_policy(
 
 def test_delays_change_each_experiment_and_are_told(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     values = []
-    for most in (1, 2):
-        assert run(finished, "--command-delay", "0", most, "--json") == 0
+    for asked, told in (((), [0, 0]), (("--command-delay", "0", "2"), [0, 2])):
+        assert run(finished, *asked, "--json") == 0
         said = json.loads(capsys.readouterr().out)
-        assert said["conditions"]["command_delay"] == [0, most]
+        assert said["conditions"]["command_delay"] == told
         values.append(said["plants"]["euler"]["rows"][0]["values"])
     assert values[0] != values[1]
 

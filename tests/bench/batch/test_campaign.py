@@ -104,6 +104,12 @@ def finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
+def test_every_log_is_one_row_in_sorted_order(folder: Path, said: Said) -> None:
+    assert list(said.rows) == sorted((*BROKEN, *GOOD))
+    assert {row["root"] for row in said.rows.values()} == {str(folder)}
+    assert {row["campaign"] for row in said.rows.values()} == {"broken", "monday", "tuesday", "friday"}
+
+
 def test_broken_logs_fail_with_the_words_of_the_command_for_one_log(folder: Path, said: Said, replay: Replay) -> None:
     assert said.code == 1
     for log in BROKEN:

@@ -30,6 +30,7 @@ def test_a_gap_that_hides_what_acted_is_said(tmp_path: Path, simulate: Simulate,
     got = replay.document(path)
     assert got["model_fits"]
     assert (len(got["caveats"]), len(got["warnings"])) == (2, 1)  # of single periods, and of gaps
+    assert f"WARNING: {got['warnings'][0]}"[:60] in replay.text(path)
     assumed = replay.document(path, "--method", "windows", "--window", "0.04")["warnings"]
     assert "4 periods" in assumed[1]
     assert len(replay.document(path, "--method", "rls")["warnings"]) == 1

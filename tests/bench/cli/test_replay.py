@@ -69,6 +69,38 @@ def test_information_over_time_grows_to_that_of_the_whole(path: Path, replay: Re
         assert series["lambda_min"][-1] == pytest.approx(got[kind]["lambda_min"], rel=1e-12)
 
 
+def test_an_information_has_the_model_the_unknowns_and_the_prior_that_were_asked_for(log: Log, replay: Replay) -> None:
+    path = log("exact.mcap", "plant=exact")
+    alone = replay.document("fim", path, "--theta", "nominal")
+    assert (alone["model"], alone["warnings"]) == ("exact", [])
+    other = replay.document("fim", path, "--theta", "nominal", "--model", "euler")
+    assert (other["model"], other["fit_sigmas"]["fits"], len(other["warnings"])) == ("euler", False, 1)
+    along = replay.document("fim", path, "--theta", "nominal", "--nuisance", "delay,offset,x1_0")
+    assert along["nuisances"] == ["delay", "offset", "x1_0"]
+    whole = np.array(along["physical"]["matrix"])
+    schur = whole[:4, :4] - whole[:4, 4:] @ np.linalg.solve(whole[4:, 4:], whole[4:, :4])
+    assert along["physical"]["log_det"] == pytest.approx(np.linalg.slogdet(schur)[1], rel=1e-6)
+    inertia = replay.document("fim", path, "--theta", "nominal", "--nuisance", "J")["physical"]
+    assert (inertia["identified"], inertia["log_det"]) == (False, None)
+    known = replay.document("fim", path, "--theta", "nominal", "--nuisance", "J", "--prior", "pm50")
+    assert (known["prior"], known["physical"]["identified"]) == ("pm50", True)
+
+
+def test_a_cut_log_and_one_that_tells_nothing_are_said_first(
+    path: Path, tmp_path: Path, simulate: Simulate, replay: Replay
+) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert (
+        replay.text("fim", path, "--theta", "true").count("WARNING") == 2
+    )  # the file is cut, and the experiment with it
+    assert replay.text("info", path).startswith("WARNING")
+    still = write_log(tmp_path / "zero.mcap", simulate(lambda *_: 0.0))
+    for prior in ((), ("--prior", "pm50")):
+        said = replay.text("fim", still, *prior)
+        assert "no information" in said
+        assert "inf" not in said.replace("information", "")
+
+
 def test_a_log_that_does_not_say_what_moved_is_evaluated_with_the_brake_that_sticks(
     tmp_path: Path, run: SimRun, replay: Replay
 ) -> None:

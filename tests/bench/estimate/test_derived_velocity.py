@@ -83,6 +83,12 @@ def test_a_measured_velocity_is_no_observer_s_on_any_plant(bench: Bench, plant: 
     assert not any(derived([drawn(bench, seed, plant)], T_S) for seed in range(5))
 
 
+def test_a_lag_that_no_observer_makes_explains_no_misfit(bench: Bench) -> None:
+    """A score test alone finds a lag in other misfits too."""
+    found = [fit(bench, "exact", [record(bench, bench.plant(name), currents_of(bench, "chirp"))]) for name in MEASURED]
+    assert "velocity_lag" not in {e.validation.cause.suspect.name for e in found if e.validation.cause}
+
+
 @pytest.mark.parametrize(
     "sensors",
     [

@@ -119,3 +119,14 @@ def test_what_it_cannot_estimate_is_refused(bench: Bench) -> None:
     hardly_moving = record(bench, bench.plant("exact"), np.full(50, 0.1))
     with pytest.raises(UsageError):
         estimate(bench, "exact", [hardly_moving])
+
+
+def test_instruments_are_taken_into_account(bench: Bench) -> None:
+    true = np.array([getattr(bench.brake, n) for n in PARAMETER_NAMES])
+    for plant in ("offset", "late", "jitter"):
+        found = estimate(bench, plant, [chirped(bench, plant)])
+        assert (np.abs(found.values / true - 1.0) < 0.25).all()
+    found = estimate(bench, "observer", [chirped(bench, "observer")])
+    assert len(caveats(found)) == 3
+    late = replace(chirped(bench), late=np.full(500, 2e-5))
+    assert len(caveats(estimate(bench, "exact", [late]))) == 3

@@ -145,7 +145,6 @@ VIRTUAL: dict[str, Any] = {"metadata": {"emb.run": {"steps": "500", "iface": "vc
         ([REAL], ""),
         ([{}], "SIMULATED: the values are of a simulated brake, not of a real machine."),
         ([VIRTUAL], "SIMULATED: the values are of a node on a virtual bus (vcan0), not of a real machine."),
-        ([REAL, REAL], ""),
         ([REAL, {}], "SIMULATED: the values are of a simulated brake in 1 of 2 runs (1.mcap), not of a real machine."),
         (
             [{}, VIRTUAL],

@@ -103,6 +103,12 @@ def test_a_run_ends_with_its_page_where_that_is_asked_for_and_possible(
     assert not (tmp_path / "run.mcap").exists()
 
 
+def test_the_shipped_bench_is_written_for_editing(emb_run: EmbRun, tmp_path: Path) -> None:
+    path = tmp_path / "my.toml"
+    emb_run.text("--write-bench", str(path))
+    assert path.read_text() == shipped_bench_text()
+
+
 def test_no_node_is_a_bus_error_with_the_table_and_a_document(
     emb_run: EmbRun, edited: Edited, sim: Sim, tmp_path: Path
 ) -> None:
