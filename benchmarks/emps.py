@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from emb_bench.estimate.estimate import Estimate
-from emb_bench.estimate.method import method_of
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import make_problem
 from emb_bench.estimate.records import EstimationProblem
 from emb_bench.estimate.windows import predict_windows

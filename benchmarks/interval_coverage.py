@@ -51,7 +51,7 @@ from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import Plant
 from emb_bench.estimate.average import SHARES
 from emb_bench.estimate.effects import with_systematic
-from emb_bench.estimate.method import method_of
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.records import FREE, NORMAL_95, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES

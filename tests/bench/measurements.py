@@ -15,7 +15,7 @@ from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Instruments, Plant
 from emb_bench.estimate.estimate import Estimate
-from emb_bench.estimate.method import method_of
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import EstimationProblem
 from emb_bench.excitation import parse_excitation, run_excitation

@@ -22,7 +22,7 @@ from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import quantity
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.innovations import Filter
-from emb_bench.estimate.method import method_of
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.model_validation import taken
 from emb_bench.estimate.output_error import searched
 from emb_bench.estimate.prediction import Problem

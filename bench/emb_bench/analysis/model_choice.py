@@ -34,7 +34,7 @@ from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, Instruments, Mechanics, Plant
 from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.estimate import Estimate
-from emb_bench.estimate.method import method_of
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import Fit, reweighted, search, with_gaps
 from emb_bench.estimate.prediction import Problem, make_problem
 from emb_bench.estimate.records import EstimationProblem, has_time_for_a_delay

@@ -25,7 +25,7 @@ from emb_bench.config.bench import Bench
 from emb_bench.config.plants import EXACT, Plant
 from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.estimate import Estimate
-from emb_bench.estimate.method import method_of
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import EstimationProblem, check_model
 from emb_bench.experiment.experiment import Experiment

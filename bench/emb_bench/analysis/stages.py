@@ -20,7 +20,7 @@ from emb_bench.brake.parameters import least
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, EVERY, Plant
 from emb_bench.estimate.intervals import bounded, union
-from emb_bench.estimate.method import method_of
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import too_few
 from emb_bench.estimate.records import Unknown
 from emb_bench.experiment.experiment import Experiment

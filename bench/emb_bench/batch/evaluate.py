@@ -74,7 +74,7 @@ def _steps(source: Source, options: CampaignOptions, given: Bench | None) -> Ite
         yield {"T": interval.of_comparison, "I": interval.of_repeatability}
     if options.method == NONE:
         return
-    from emb_bench.estimate.method import method_of
+    from emb_bench.estimate.methods import method_of
 
     problem = with_systematic(EstimationProblem(**vars(question)), bench, plant)
     method = method_of(options.method)(bench, plant, problem, starts=options.starts, seed=options.seed)

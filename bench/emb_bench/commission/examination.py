@@ -21,7 +21,7 @@ from emb_bench.config.plants import DEFAULT_PLANT, Instruments, Mechanics, Plant
 from emb_bench.estimate.derived_velocity import derived
 from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.estimate import Estimate
-from emb_bench.estimate.method import method_of
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import NORMAL_95, EstimationProblem
 from emb_bench.experiment.experiment import Booleans, Experiment, Floats

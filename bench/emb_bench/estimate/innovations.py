@@ -260,15 +260,15 @@ def march_filtered(
         for output in range(2):  # angle, then velocity; the brake goes on to its stamp as it went through the period
             if root[i, output] == 0.0:
                 continue
-            predicted = reading(x[0], x[1], acceleration, tau, bias, velocity_scale)[output]
+            shown = reading(x[0], x[1], acceleration, tau, bias, velocity_scale)[output]
             h1, h2 = (1.0, tau) if output == 0 else (0.0, velocity_scale)
             if not fixed:
                 _weigh(covariance, h1, h2, 1.0 / root[i, output] ** 2, gains[i, output])
             k1, k2, scale, k3 = gains[i, output, 0], gains[i, output, 1], gains[i, output, 2], gains[i, output, 3]
-            surprise = samples[i, output] - predicted
+            surprise = samples[i, output] - shown
             innovations[i, output] = surprise * scale
             for j in range(first, unknowns.shape[0]):
-                share = h1 * s[j, 0] + h2 * s[j, 1] + sensor_share(int(unknowns[j]), output, predicted / velocity_scale)
+                share = h1 * s[j, 0] + h2 * s[j, 1] + sensor_share(int(unknowns[j]), output, shown / velocity_scale)
                 shares[i, j - first, output] = share * scale / delay_share(int(unknowns[j]), late)
                 s[j, 0] -= k1 * share
                 s[j, 1] -= k2 * share

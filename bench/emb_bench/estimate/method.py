@@ -1,9 +1,4 @@
-"""Estimation methods: options in the constructor, ``fit`` gives the estimate.
-
-    OutputError(bench, plant, EstimationProblem(("k_m", "T_c"))).fit(experiments)
-
-Each method has its module, which imports scipy and numba; :func:`method_of` imports it.
-"""
+"""Base of the estimation methods: options in the constructor, ``fit`` gives the estimate."""
 
 from __future__ import annotations
 
@@ -16,7 +11,7 @@ from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Plant
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.prediction import Problem, make_problem
-from emb_bench.estimate.records import METHODS, STARTS, EstimationProblem
+from emb_bench.estimate.records import STARTS, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.errors import UsageError
 
@@ -54,25 +49,3 @@ class Method(ABC):
     @abstractmethod
     def solve(self, problem: Problem) -> Estimate:
         """Estimate the unknowns of a problem that has been checked."""
-
-
-def method_of(name: str) -> type[Method]:
-    """The method of a name, a key of ``METHODS``."""
-    match name:
-        case "oem":
-            from emb_bench.estimate.output_error import OutputError
-
-            return OutputError
-        case "pem":
-            from emb_bench.estimate.prediction_error import PredictionError
-
-            return PredictionError
-        case "rls":
-            from emb_bench.estimate.least_squares import RecursiveLeastSquares
-
-            return RecursiveLeastSquares
-        case "windows":
-            from emb_bench.estimate.windows import Windows
-
-            return Windows
-    raise UsageError(f"no method is called '{name}'; expected one of {', '.join(METHODS)}")

@@ -120,10 +120,10 @@ def simulate_parts(
             states, moved = (np.concatenate(both) for both in zip(waiting, (states, moved), strict=True))
             waiting = states[n:-1], moved[n:-1]
         unknowns = np.append(indices, np.full(part.gap_unknowns, COMMAND))
-        found = _samples_along(states[: n + 1], moved[: n + 1], unknowns, theta, theta.offset(plant), part.late, t_s)
+        shown = _shown(states[: n + 1], moved[: n + 1], unknowns, theta, theta.offset(plant), part.late, t_s)
         if early:
-            found = found._replace(sensitivities=np.delete(found.sensitivities, len(params), axis=1))
-        yield found
+            shown = shown._replace(sensitivities=np.delete(shown.sensitivities, len(params), axis=1))
+        yield shown
 
 
 def simulate_shares(
@@ -143,7 +143,7 @@ def simulate_shares(
     states, s = np.tile(x, (len(shares) + 1, 1)), np.zeros((len(shares) + 1, len(unknowns), SENSITIVE))
     loop(plant.mechanics, theta.brake, _acting(plant, theta, experiment, t_s), unknowns, shares, states, s)
     rows = later(states, delay), later(s, delay)
-    return _samples_along(*rows, unknowns, theta, theta.offset(plant), experiment.late, t_s).sensitivities
+    return _shown(*rows, unknowns, theta, theta.offset(plant), experiment.late, t_s).sensitivities
 
 
 def _acting(plant: Plant, theta: Theta, experiment: Experiment, t_s: float) -> Input:
@@ -184,9 +184,9 @@ def simulate_apart(
     if delay:
         seen = np.maximum(np.arange(ends[-1]) - delay, np.repeat(first, np.diff(ends, prepend=0)))
         states, moved = states[seen], moved[seen]
-    found = _samples_along(states, moved, indices, theta, theta.offset(plant), late[1:], t_s)
+    shown = _shown(states, moved, indices, theta, theta.offset(plant), late[1:], t_s)
     real = np.delete(np.arange(ends[-1]), first) - 1  # no sample is between the end of one and the start of the next
-    return Trajectory(found.states, found.samples[real], found.sensitivities[real, : len(params)])
+    return Trajectory(shown.states, shown.samples[real], shown.sensitivities[real, : len(params)])
 
 
 def gap_ends(experiment: Experiment, instruments: Instruments) -> tuple[Integers, Floats]:
@@ -210,7 +210,7 @@ def later(rows: Floats, delay: int) -> Floats:
     return np.concatenate([np.repeat(rows[:1], delay, axis=0), rows])[: len(rows)]
 
 
-def _samples_along(
+def _shown(
     x: Floats, s: Floats, unknowns: Integers, theta: Theta, offset: float, late: Floats | None, t_s: float
 ) -> Trajectory:
     """Samples along the states ``x`` of n + 1 instants, with their sensitivities ``s``.

@@ -7,7 +7,7 @@ import pytest
 
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.estimate.estimate import Estimate
-from emb_bench.estimate.method import method_of
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import make_problem
 from emb_bench.estimate.records import EstimationProblem
 from emb_bench.estimate.windows import Cut, by_windows, predict_windows
