@@ -118,3 +118,10 @@ def test_a_half_of_an_interval_never_stands_without_its_name() -> None:
         for i, line in enumerate(lines):
             if re.search(r"± 95 %|k ?= ?2\b(?!\.)", line) and "studies" not in page.parts:
                 assert NAMES.search(" ".join(lines[max(0, i - 1) : i + 2])), f"{page.name}:{i + 1}: {line}"
+
+
+def test_a_number_has_no_power_of_ten_of_a_programmer(texts: Texts) -> None:
+    for command, text in texts.items():
+        text = text if command != "live" else text.partition("</html>")[2]
+        assert not re.search(r"\d[eE][-+]\d", text), command
+        assert not re.search(r"0\.0000000", text), command

@@ -206,6 +206,12 @@ def test_links_lead_somewhere_and_names_are_unique(report: Report, joint: Report
         assert all(link.startswith("#") and link[1:] in names for link in links)
 
 
+def test_every_figure_says_what_it_shows(report: Report) -> None:
+    says = report.reader.values("alt")
+    assert len(says) == report.reader.tags.count("img") >= 5
+    assert all(len(text) > 30 for text in says)
+
+
 def test_the_page_needs_nothing_but_itself(report: Report, joint: Report) -> None:
     for made, most in ((report, 1.5e6), (joint, 3e6)):
         assert len(made.html) < most
