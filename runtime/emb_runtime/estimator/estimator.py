@@ -21,8 +21,7 @@ class Estimator:
         """Make the model, and begin."""
         self.model = make_model(bench, bench.range_set(bench.prior))
         self.state: State = initial_state(self.model)
-        self._relative: tuple[State | None, Four] = None, (0.0, 0.0, 0.0, 0.0)  # and the state that they are of
-        self._parameters: tuple[State | None, tuple[float, ...]] = None, ()  # the same
+        self._computed: tuple[State | None, tuple[float, ...]] = None, ()  # the parameters, and the state they are of
 
     def begin_run(self) -> None:
         """Begin anew: the next sample is the first one of a run."""
@@ -34,12 +33,8 @@ class Estimator:
 
     @property
     def relative(self) -> Four:
-        """k_m, k_1, T_c and f_v relative to their nominal values, within their ranges; computed once a sample."""
-        state, relative = self._relative
-        if state is not self.state:
-            relative = believed(self.model, self.state)
-            self._relative = self.state, relative
-        return relative
+        """k_m, k_1, T_c and f_v relative to their nominal values, within their ranges."""
+        return believed(self.model, self.state)
 
     def in_si(self, relative: Four) -> Four:
         """Relative parameters, or their deviations, in SI units."""
@@ -53,11 +48,11 @@ class Estimator:
 
         Computed once a sample: the policy takes them before the command leaves, the log after it.
         """
-        state, parameters = self._parameters
+        state, parameters = self._computed
         if state is not self.state:
             relative = self.relative
             parameters = self.in_si(relative) + self.in_si(deviations(self.model, self.state, relative))
-            self._parameters = self.state, parameters
+            self._computed = self.state, parameters
         return parameters
 
     @property
