@@ -37,7 +37,10 @@ CALLS = {
     "info": [f"{log}.mcap" for log in (*LOGS, "cut", "rejected", "broken")],
     "timing": ["used.mcap", "damaged.mcap", "used.mcap rejected.mcap"],
     "rerun": [f"{log}.mcap" for log in ("used", "rejected", "cut", "damaged")],
-    "fim": [f"{log}.mcap --theta nominal" for log in (*LOGS, "rejected")],
+    "fim": [
+        *(f"{log}.mcap --theta nominal" for log in (*LOGS, "rejected")),
+        "good.mcap --theta nominal --nuisance J --prior pm50",
+    ],
     "estimate": [
         *(f"{log}.mcap --starts 1" for log in LOGS[:-1]),
         *(f"good.mcap --starts 1 --method {method}" for method in ("pem", "rls", "windows --window 0.04")),

@@ -115,10 +115,30 @@ def alike(expected: str, text: str, relative: float) -> bool:
         ("estimate-aborted", ["estimate", "aborted.mcap", "--starts", "2"]),
         ("estimate-still", ["estimate", "still.mcap", "--starts", "1"]),
         ("estimate-rls", ["estimate", "good.mcap", "--method", "rls"]),
+        ("fim-still", ["fim", "still.mcap"]),
     ],
 )
 def test_a_command_says(say: Say, golden: Callable[[str, str], None], name: str, arguments: list[str]) -> None:
     golden(name, say(*arguments))
+
+
+@pytest.mark.parametrize(
+    ("command", "more", "code"),
+    [
+        ("fim", [], 0),
+        ("info", [], 0),
+        ("rerun", [], 0),
+        ("timing", [], 2),
+        ("estimate", ["--starts", "1"], 0),
+        ("report", ["--starts", "1", "-o", "page.html"], 0),
+        ("export", ["--topic", "/cycle", "-o", "cycles.csv"], 0),
+    ],
+)
+def test_what_a_cut_log_lacks_is_said_first(say: Say, command: str, more: list[str], code: int) -> None:
+    lines = say(command, "cut.mcap", *more, code=code).splitlines()
+    said = next(line for line in lines if not line.startswith("SIMULATED: "))
+    assert said.startswith("WARNING: ")
+    assert "the file is cut at byte" in said
 
 
 def test_several_runs_are_compared_with_an_earlier_estimate_and_with_each_other(

@@ -84,6 +84,9 @@ def _report(args: argparse.Namespace) -> int:
 
     for name, line in outside(made.study, made.bench):
         show(f"{name}: {line}")
+    for run in made.study.reported:
+        if run.log.missing:
+            show(f"WARNING: {run.name}: {run.log.missing}")
     show(f"{args.output} and {args.output.with_suffix('.json').name}: {made.sentence}")
     for line in made.without_part:
         complain("emb-replay", LogError(line))

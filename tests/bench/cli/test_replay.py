@@ -86,14 +86,9 @@ def test_an_information_has_the_model_the_unknowns_and_the_prior_that_were_asked
     assert (known["prior"], known["physical"]["identified"]) == ("pm50", True)
 
 
-def test_a_cut_log_and_one_that_tells_nothing_are_said_first(
-    path: Path, tmp_path: Path, simulate: Simulate, replay: Replay
+def test_an_experiment_that_tells_nothing_is_reported_as_that(
+    tmp_path: Path, simulate: Simulate, replay: Replay
 ) -> None:
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    assert (
-        replay.text("fim", path, "--theta", "true").count("WARNING") == 2
-    )  # the file is cut, and the experiment with it
-    assert replay.text("info", path).startswith("WARNING")
     still = write_log(tmp_path / "zero.mcap", simulate(lambda *_: 0.0))
     for prior in ((), ("--prior", "pm50")):
         said = replay.text("fim", still, *prior)

@@ -92,6 +92,20 @@ def test_it_says_that_it_estimates_no_systematic_errors_where_the_bench_cannot_e
     assert (found.deviations() == trusted.deviations()).all()
 
 
+def test_instruments_are_taken_into_account(bench: Bench) -> None:
+    true = np.array([getattr(bench.brake, n) for n in PARAMETER_NAMES])
+    for plant in ("offset", "late", "jitter"):
+        found = estimate(bench, plant, [chirped(bench, plant)])
+        assert (np.abs(found.values / true - 1.0) < 0.25).all(), plant
+    late = replace(chirped(bench), late=np.full(500, 2e-5))
+    for found, said in (
+        (estimate(bench, "observer", [chirped(bench, "observer")]), "the velocity is an observer's"),
+        (estimate(bench, "exact", [late]), "all samples count at the instants of the grid"),
+    ):
+        assert len(caveats(found)) == 3
+        assert said in caveats(found)[2]
+
+
 def test_what_the_brake_never_met_is_not_told(bench: Bench) -> None:
     data = record(bench, bench.plant("exact"), np.full(60, -1.5))
     found = estimate(bench, "exact", [data], EstimationProblem(("k_m", "k_1")))
@@ -119,14 +133,3 @@ def test_what_it_cannot_estimate_is_refused(bench: Bench) -> None:
     hardly_moving = record(bench, bench.plant("exact"), np.full(50, 0.1))
     with pytest.raises(UsageError):
         estimate(bench, "exact", [hardly_moving])
-
-
-def test_instruments_are_taken_into_account(bench: Bench) -> None:
-    true = np.array([getattr(bench.brake, n) for n in PARAMETER_NAMES])
-    for plant in ("offset", "late", "jitter"):
-        found = estimate(bench, plant, [chirped(bench, plant)])
-        assert (np.abs(found.values / true - 1.0) < 0.25).all()
-    found = estimate(bench, "observer", [chirped(bench, "observer")])
-    assert len(caveats(found)) == 3
-    late = replace(chirped(bench), late=np.full(500, 2e-5))
-    assert len(caveats(estimate(bench, "exact", [late]))) == 3
