@@ -57,7 +57,7 @@ NEW: dict[str, tuple[Lie, ...]] = {
     "stiffness changes to": tuple(Lie(stiffness=k, begin=0.25) for k in (0.5, 0.8, 1.3)),
 }
 """Kinds that were not among those found by the first attack."""
-UNDETECTED = 9  # Named in docs/explanation/sensor-monitor.md
+UNDETECTED = 10  # Named in docs/explanation/sensor-monitor.md
 
 
 def size_of(lie: Lie) -> str:

@@ -127,7 +127,7 @@ class FitOptions(SearchOptions):
         problem = EstimationProblem(**vars(self.question(bench)), known=priors, window=self.window)
         if no_unknowns := [name for name in priors if name not in problem.names]:
             raise UsageError(f"--known {', '.join(no_unknowns)}: expected one of {', '.join(problem.names)}")
-        for name in (name for name in PARAMETER_NAMES if name in priors):
+        for name in filter(priors.__contains__, PARAMETER_NAMES):
             check_near_nominal(bench, name, priors[name][0], "--known ")
         problem = freed(problem, bench)
         return with_systematic(problem, bench, plant) if self.systematic == "bench" else problem

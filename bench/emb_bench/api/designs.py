@@ -44,7 +44,7 @@ class DesignOptions(Options):
 
 
 def design(options: DesignOptions | None = None, *, told: Callable[[str], object] | None = None, **more: Any) -> Report:
-    """Optimal current sequence for given parameters, within the limits of the bench.
+    """Optimal current sequence for known parameters, within the limits of the bench.
 
     Args:
         options: a record of options.

@@ -98,7 +98,7 @@ def fisher_information(
 def interval(information: Information) -> Interval:
     """The interval that an estimate will have: of the run or the currents of an information, with its unknowns.
 
-    It has the unknowns of :func:`estimate`, the systematic errors of the bench among them, and its budget.
+    It has the unknowns of :func:`emb_bench.api.estimate`, the bench's systematic errors among them, and its budget.
 
     Args:
         information: what :func:`fisher_information` returned of one run, or of planned currents.

@@ -41,7 +41,7 @@ TERMS = 8  # Of the series
 LONGEST = 0.05
 """Longest segment, times the rate at which the derivatives grow: the first omitted term is below 1e-16 of the sum."""
 _ITERATIONS = 60  # of a root search; Newton needs 3 to 5, bisection alone 55
-_ROUNDING = 1e-15  # resolution of the time, over a segment's length
+_ROUNDING = 1e-15  # relative resolution of a time within a segment
 
 
 def advance_exact(
@@ -187,7 +187,7 @@ def late_start(before: float, caught: float, now: float) -> float:
     """Change of velocity of a brake at rest per delay of a command [rad/s²].
 
     Accelerations: ``before`` from rest under the previous command, 0 if it sticks; ``caught`` under the new command at
-    slow sliding in the direction of the previous one; ``now`` from rest under the new command.
+    slow sliding in the direction in which the previous command moves it; ``now`` from rest under the new command.
     """
     if before == 0.0 or caught == 0.0:
         return -now

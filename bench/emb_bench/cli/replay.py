@@ -82,11 +82,11 @@ def _report(args: argparse.Namespace) -> int:
     made = api.report(args.runs, args.output, given(args, api.ReportOptions))
     from emb_bench.report.sentences import outside
 
-    for name, line in outside(made.study, made.bench):
-        show(f"{name}: {line}")
     for run in made.study.reported:
         if run.log.missing:
             show(f"WARNING: {run.name}: {run.log.missing}")
+    for name, line in outside(made.study, made.bench):
+        show(f"{name}: {line}")
     show(f"{args.output} and {args.output.with_suffix('.json').name}: {made.sentence}")
     for line in made.without_part:
         complain("emb-replay", LogError(line))

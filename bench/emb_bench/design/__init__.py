@@ -1,1 +1,1 @@
-"""Optimal excitation for given parameters: the optimum that policies are compared with."""
+"""Optimal excitation for known parameters: the optimum that policies are compared with."""

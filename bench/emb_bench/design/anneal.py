@@ -30,7 +30,7 @@ TEMPERATURE = 2e-4  # Mean loss of φ that is accepted at the start; it falls to
 SOFTNESS = 0.03
 """Initial softness of the criterion, which rounds E's kinks; it falls to zero in the warmer half. In good designs for E
 the two smallest eigenvalues are equal, and hardly a variation increases both."""
-PRICE = 0.3  # Share of the price of leaving the box for a variation, which the polish moves back into it
+PRICE = 0.3  # Share of the price of leaving the box that a variation pays; the polish moves it back inside
 HOPELESS = 0.05  # Loss by that price beyond which a variation is dropped before its information is computed
 TWICE = 0.4  # Share of the variations that are two changes
 AT_TURNS = 0.4  # Share of the changes that begin near a turn
@@ -135,14 +135,14 @@ def anneal(task: Task, goal: int, count: int, rng: np.random.Generator, tracks: 
             continue
         s[first], m[first] = tracks.s[at, first], tracks.m[at, first]
         inform(task, first, u, x, s, m)
-        temperature = 1.0 - number / count
-        softness = max(0.0, 2.0 * temperature - 1.0) * SOFTNESS
+        remaining = 1.0 - number / count
+        softness = max(0.0, 2.0 * remaining - 1.0) * SOFTNESS
         now = phi(goal, tracks.m[at, n], softness, work) - PRICE * tracks.price[at]
         worth = phi(goal, m[n], softness, work) - PRICE * tracks.price[to]
-        if worth >= now - TEMPERATURE * temperature * temperature * rng.exponential():
+        if worth >= now - TEMPERATURE * remaining * remaining * rng.exponential():
             s[:first], m[:first] = tracks.s[at, :first], tracks.m[at, :first]
             at = to
-            if temperature <= 0.5 and worth > most:
+            if remaining <= 0.5 and worth > most:
                 most = worth
                 best[:] = u
 

@@ -1,11 +1,11 @@
 """Every sample of a design to its local optimum: sequential linear programming with a trust region.
 
 The motion and the Fisher information are linearised in the currents: the maps of the single periods are differentiated,
-and an adjoint sweep gives every element of M. The criterion is concave
-in M, so that its tangents at a few matrices bound it from above (Kelley's cutting planes). The result is a sparse
-linear program over changes of currents and states within the limits, which HiGHS solves. A step counts if the simulated
-criterion grows. Optima of this problem lie on corners: currents and speeds at their limits, the end at the edge of
-home. So do the solutions of linear programs (Fletcher and Sainz de la Maza, Mathematical Programming 43, 1989).
+and an adjoint sweep gives every element of M. The criterion is concave in M, so that its tangents at a few matrices
+bound it from above (Kelley's cutting planes). The result is a sparse linear program over changes of currents and states
+within the limits, which HiGHS solves. A step counts if the simulated criterion grows. Optima of this problem lie on
+corners: currents and speeds at their limits, the end at the edge of home. So do the solutions of linear programs
+(Fletcher and Sainz de la Maza, Mathematical Programming 43, 1989).
 """
 
 from __future__ import annotations

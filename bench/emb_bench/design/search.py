@@ -49,7 +49,7 @@ LAST = 2  # Annealings of the last design in each round, so that two processors 
 ROUNDS = 20  # Most rounds of annealing
 PATIENCE = 4  # Rounds over which the gain is judged
 GAIN = 3e-4  # Gain of φ over these rounds below which the search ends
-SOFT = 0.05  # Share of the price of leaving the box for a coarse design, which the polish moves back into it
+SOFT = 0.05  # Share of the price of leaving the box that a coarse design pays; the polish moves it back inside
 FIRM = 20.0  # The same where no polish follows
 WORST = -1e3  # Worth of a table without information
 LONG = Settings(steps=80, tolerance=5e-5, cuts=4)  # Polish of every design at first, and of the best one at the end

@@ -25,7 +25,8 @@ def method_of(name: str) -> type[Method]:
             from emb_bench.estimate.least_squares import RecursiveLeastSquares
 
             return RecursiveLeastSquares
-        case _:  # windows
+        case "windows":
             from emb_bench.estimate.windows import Windows
 
             return Windows
+    raise AssertionError(name)

@@ -20,7 +20,7 @@ from emb_bench.information.evaluation import bench_for, default_model
 from emb_bench.information.identifiability import Spectrum
 from emb_bench.logs.log import RunLog
 from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.config.typed import SMALLEST
+from emb_runtime.config.typed import LARGEST, SMALLEST
 from emb_runtime.errors import CheckFailedError, UsageError
 
 if TYPE_CHECKING:  # scipy comes with the extra [bench]
@@ -53,7 +53,6 @@ ABOUT: Mapping[str, str] = {
     "x2_0": "velocity at the start",
 }
 """Parameters of an exported brake."""
-LARGEST = 1e30  # Of a number in a bench file
 CHOSEN = ("x1_0", "x2_0", "tolerance")  # What is of a simulation, not of the brake
 UNITS = SI | {"gamma": "m", "stribeck_exponent": "1", "hysteresis_travel": "rad", "tolerance": "rad/s"}
 _HINTS = get_type_hints(BrakeParameters, include_extras=True) | get_type_hints(Mechanics, include_extras=True)

@@ -38,7 +38,7 @@ def module_policy(policy: Any, bench: Bench, kind: str) -> tuple[bytes, str]:
 
     Raises:
         UsageError: the model has other spaces than the environment.
-        PolicyRefusedError: torch cannot export it, or see :func:`onnx_policy`.
+        PolicyRefusedError: torch cannot export it, or see :func:`emb_bench.export.own_policy.onnx_policy`.
     """
     name = type(policy).__name__
     if hasattr(policy, "policy") and hasattr(policy, "observation_space"):

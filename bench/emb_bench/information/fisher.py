@@ -153,7 +153,7 @@ class Fisher:
         return dict(zip(self.params, deviations.tolist(), strict=True))
 
     def covariance(self) -> Floats:
-        """M⁻¹, see :meth:`Spectrum.inverse`; its diagonal has the squares of :meth:`cramer_rao`."""
+        """M⁻¹ (``Spectrum.inverse`` of ``identifiability``); its diagonal has the squares of :meth:`cramer_rao`."""
         self._physical()
         return Spectrum(self.matrix).inverse()
 

@@ -228,7 +228,7 @@ def models(study: Study) -> str:
 
 
 def limit(effect: Contribution, e: Estimate) -> str:
-    """Largest effect of an interval; one that all runs share with its prior."""
+    """Name of the effect that widens an interval most; with its prior if all runs share it."""
     name, shared = shown_as(effect, e.bench.machine).name, effect.name in OF_THE_BENCH
     return f"{name}, known to {in_percent(e.question.unmodelled[effect.name])}" if shared else name
 
@@ -350,7 +350,8 @@ def _coloured(m: ModelValidation) -> str:
 def explained(cause: Cause, machine: Machine | None = None) -> str:
     """A cause with its remedy; ``machine`` is that of a bench without a brake.
 
-    Without the amount if the effect explains a part only, or if χ² gives no alarm: a linear score test is poor there.
+    With the amount only if the effect is no curve and explains all of the misfit by a possible amount: elsewhere a
+    linear score test gives it unreliably.
     """
     s = cause.suspect
     if s.observer:

@@ -162,7 +162,7 @@ def advance_shares(
 def _share_out(
     unknowns: Integers, shares: Floats, k: int, late: bool, begins: bool, every: Integers, s: Floats
 ) -> None:
-    """Divides sensitivities by the weights at the begin of a part of a period, multiplies them at its end.
+    """Divides sensitivities by the weights at the beginning of a part of a period, multiplies them at its end.
 
     In the ``late`` part the previous command still acts: it and its motor constant have the weight of the period
     before.

@@ -20,7 +20,7 @@ from msgspec import inspect
 from emb_runtime.errors import EmbError, near
 
 Record = TypeVar("Record")
-SMALLEST = 1e-30  # No number but 0 is smaller, or larger than its inverse; beyond it arithmetic overflows
+SMALLEST, LARGEST = 1e-30, 1e30  # Sizes of a number that is not 0; beyond them arithmetic overflows
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 
@@ -194,8 +194,8 @@ def _problem(value: object, kind: Any) -> str:
             number = math.inf
         if not math.isfinite(number):
             return "expected a finite number"
-        if number and not SMALLEST <= abs(number) <= 1.0 / SMALLEST:
-            return f"expected 0 or a size from {SMALLEST:g} to {1.0 / SMALLEST:g}, got {number:g}"
+        if number and not SMALLEST <= abs(number) <= LARGEST:
+            return f"expected 0 or a size from {SMALLEST:g} to {LARGEST:g}, got {number:g}"
     return ""
 
 

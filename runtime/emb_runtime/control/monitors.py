@@ -147,7 +147,7 @@ class Sensors:
             self.monitor.check(interval.elapsed, sample, interval.obeyed, interval.command)
             self.response.add_sample(sample, interval.follows, interval.command)
         except StopError as stop:
-            if stop.fault is not Fault.RESPONSE_LATE:  # which has taken it
+            if stop.fault is not Fault.RESPONSE_LATE:  # that sample is already in the rows of the response
                 self.response.watch(sample)
             raise
         if not self._homing:
@@ -157,7 +157,7 @@ class Sensors:
         """Update the motion balance with the newest sample, after its command was sent (not time critical)."""
         if self._pending is not None:
             (sample, follows), self._pending = self._pending, None
-            self._balance.take(sample, follows)
+            self._balance.add_sample(sample, follows)
 
     def check_balance(self) -> None:
         """Check the motion of a whole experiment."""
@@ -175,7 +175,7 @@ class Sensors:
         with contextlib.suppress(StopError):
             self.response.add_sample(sample, True, 0.0)
         self._balance.begin_run(sample)
-        self._balance.take(sample, True)
+        self._balance.add_sample(sample, True)
         self._balance.check_motion()
 
     @property

@@ -232,10 +232,10 @@ def fits(state: State) -> bool:
 
 
 def deviations(model: Model, state: State, used: Four) -> Four:
-    """Standard deviations of the relative parameters; at least the distance of the filter's value from the one used.
+    """Standard deviations of the relative parameters; at least the distance of the filter's values from those used.
 
-    That is of :func:`believed`. Once the model did not fit, at least those of the prior. Infinite where rounding has
-    made a variance negative.
+    ``used`` are the values of :func:`believed`. Once the model did not fit, the deviations are at least those of the
+    prior. Infinite where rounding has made a variance negative.
     """
     mean, p, doubted = state.mean, state.covariance, not fits(state)
     low, high = model.low, model.high

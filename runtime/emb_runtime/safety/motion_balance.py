@@ -334,8 +334,8 @@ class MotionBalance:
         """Begin a run with its first sample."""
         self._state = begin_balance(sample.angle, sample.velocity)
 
-    def take(self, sample: SensorSample, follows: bool) -> None:
-        """Take in one more sample, as :func:`take`; raises StopError if the motion so far has no explanation."""
+    def add_sample(self, sample: SensorSample, follows: bool) -> None:
+        """Add one more sample, as :func:`take`; raises StopError if the motion so far has no explanation."""
         self._state = take(self._model, self._state, follows, sample.angle, sample.velocity, sample.applied_current)
         if self._state.samples == 0:
             self.check_motion()

@@ -57,12 +57,12 @@ def _of_commands(model: ResponseModel, rows: Sequence[Row], stop: Sequence[Row],
     """The likeliest age of the frames, or lag of the current."""
     braked, later = stop[:BRAKES], [age for age in range(OLDEST_FRAME + 1) if age != model.age]
 
-    def deviance(age: int, lag: float, seen: int = 0) -> float:
-        return minus_log_likelihood(model, rows, braked, age, lag, seen, means)
+    def of(age: int, lag: float, seen: int = 0) -> float:
+        return deviance(model, rows, braked, age, lag, seen, means)
 
-    declared = deviance(model.age, 0.0)
-    ages = {age: min(deviance(age, 0.0, seen) for seen in range(age + 1)) for age in later}
-    flows = {lag: deviance(model.age, lag) for lag in LAGS}
+    declared = of(model.age, 0.0)
+    ages = {age: min(of(age, 0.0, seen) for seen in range(age + 1)) for age in later}
+    flows = {lag: of(model.age, lag) for lag in LAGS}
     aged, lagged = min(ages.values()), min(flows.values())
     if not min(aged, lagged) < declared - LIKELY:  # this way round, nothing fits where both are infinite
         return "" if not stop else _of_commands(model, rows, (), means)
@@ -87,7 +87,7 @@ def _of_lag(model: ResponseModel, flows: dict[float, float]) -> str:
     return f"the current lags by {lag * 1e3:.1f} ms: [shield] current_lag = {most:g}"
 
 
-def minus_log_likelihood(
+def deviance(
     model: ResponseModel,
     rows: Sequence[Row],
     stop: Sequence[Row],

@@ -19,8 +19,8 @@ The argument, in short (in full, with what it does not cover, in ``docs/explanat
 * By the worst brake's arrival time the shield takes over to be home at the end of the experiment.
 
 All accelerations are torques over the inertia [rad/s²]; a name that ends in ``_low``/``_high`` is a bound of the box.
-What most cycles compute writes ``b if b < a else a`` for ``min(a, b)``, and likewise for ``max``: it is what these
-give, zeros and NaN included, in a third of their time.
+Functions that run in most cycles have ``b if b < a else a`` in place of ``min(a, b)``, and likewise for ``max``: it
+gives the same, zeros and NaN included, in a third of the time.
 """
 
 from __future__ import annotations

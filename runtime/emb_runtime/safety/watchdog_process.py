@@ -1,9 +1,9 @@
 """The watchdog process: sends the stop frame when the loop stands still or is gone, and can send nothing else.
 
 ``python -m emb_runtime.safety.watchdog_process HEARTBEAT_FD [LOOP_SOCKET_FD] DOCUMENT_FD``, started by
-:class:`emb_runtime.safety.watchdog.Watchdog` and by nobody else. It has another socket of the bus, a priority above the
-loop's, and 225 frames made beforehand: disabled, 0 A, one for each pair of counters. What is in the shared memory
-chooses among them and cannot make another.
+:class:`emb_runtime.safety.watchdog.WatchdogHandle` and by nobody else. It has another socket of the bus, a priority
+above the loop's, and 225 frames made beforehand: disabled, 0 A, one for each pair of counters. What is in the shared
+memory chooses among them and cannot make another.
 
 Why no enabled command acts after the trip. ``tripped`` is set before the first stop frame leaves, and the guard asks
 for it before each command. One command may be past that question: its loop was stopped between asking and sending. It

@@ -264,7 +264,7 @@ def sample(row: Row) -> SensorSample:
 
 def feed(balance: MotionBalance, rows: Iterator[Row]) -> None:
     for row in rows:
-        balance.take(sample(row), row.follows)
+        balance.add_sample(sample(row), row.follows)
 
 
 def test_an_honest_run_is_explained_and_a_gain_that_changes_ends_it_with_the_next_entry() -> None:
