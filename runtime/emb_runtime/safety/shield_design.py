@@ -102,7 +102,7 @@ class WayHome(NamedTuple):
 
 
 class ShieldLaw(NamedTuple):
-    """Parameters of :func:`emb_runtime.safety.shield.shield`, floats and integers only; ``_low``/``_high``: of the box."""
+    """Parameters of :func:`emb_runtime.safety.shield.shield`: floats and integers; ``_low``/``_high``: of the box."""
 
     sample_time: float  # [s]
     steps: int  # Commands in one experiment
