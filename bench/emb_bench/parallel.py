@@ -150,14 +150,19 @@ def processes() -> Iterator[Executor]:
     pool = ProcessPoolExecutor(processors(), mp_context=_SPAWN, initializer=_end_with_parent)
     try:
         with _environment(), _deaf():
-            pool.submit(os.getpid).result()  # which begins all of them
+            for begun in [pool.submit(os.getpid) for _ in range(processors())]:  # each begins one while none is idle
+                begun.result()
         yield pool
     finally:
         pool.shutdown(cancel_futures=True)
 
 
 def _end_with_parent() -> None:
-    """Let a process of a pool end with its parent: the pool's pipes do not, as its other processes hold them open."""
+    """Let a process of a pool end with its parent: the pool's pipes do not, as its other processes hold them open.
+
+    Nor would ``emb_runtime.system.child_process.end_with``: its signal is Linux's, and comes when the thread ends that
+    began the process.
+    """
 
     def wait(sentinel: int) -> None:
         connection.wait([sentinel])
