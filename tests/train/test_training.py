@@ -112,7 +112,7 @@ def test_the_search_for_a_plan_has_a_price_of_its_own_for_a_lie_that_the_motion_
     make_tiny(monkeypatch)
     bench = load_bench(finished_speeds / BENCH)
 
-    def returns(searched: float, learned: float) -> tuple[float, float]:
+    def returns(searched: float | None, learned: float) -> tuple[float, float]:
         """Return of the best plan that was drawn, and score of the actor that follows the best of all."""
         training = load_preset("interval", **{"plan.hidden": searched, "demands.hidden": learned})
         folder, shown = tmp_path / f"{searched},{learned}", list[Any]()
@@ -122,6 +122,7 @@ def test_the_search_for_a_plan_has_a_price_of_its_own_for_a_lie_that_the_motion_
 
     (plan, score), (same, paid), (free, _) = returns(10.0, 4.0), returns(10.0, 0.0), returns(0.0, 4.0)
     assert plan == same < free
+    assert returns(None, 0.0)[0] == free
     assert score < paid
 
 

@@ -23,7 +23,6 @@ from emb_bench.information.symmetric import Floats
 from emb_train.closed_loop import Count, Positive, Price
 from emb_train.env import EmbExcitationVectorEnv
 from emb_train.ppo import at_once
-from emb_train.rewards import DEMANDS
 
 BOUND = 1.05  # Beyond the ends of the numbers, so that full speed is inside
 CREEP = 0.5  # Greatest root of a level that is drawn and is no full stroke
@@ -41,7 +40,7 @@ class PlanSearch(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     brakes: Count = 16  # Of each plant, on which the plans of the last search are compared
     levels: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 9  # Of a plan; seven nearly suffice
     spread: Positive = 0.15  # First standard deviation of its numbers, -1 to 1, in CMA-ES
-    hidden: Price = DEMANDS.hidden  # Price of what a lie is short of [nat], in place of that which PPO pays
+    hidden: Price | None = None  # Price of what a lie is short of [nat]; None: that of the demands, which PPO pays
 
     @property
     def rounds(self) -> int:

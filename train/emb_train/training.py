@@ -278,8 +278,8 @@ def follow_plan(
         show(None)
         clone(actor, plan, bench, training.ppo, torch.Generator().manual_seed(training.seed))
 
-    demands = msgspec.structs.replace(training.demands, hidden=options.hidden)
-    searching = msgspec.structs.replace(training, demands=demands)
+    hidden = training.demands.hidden if options.hidden is None else options.hidden
+    searching = msgspec.structs.replace(training, demands=msgspec.structs.replace(training.demands, hidden=hidden))
     environments = searching.environments(bench, options.population * options.brakes, pool)
     compared = Compared(environments, training.ppo.rollout, training.seed)
     rng = np.random.default_rng(np.random.SeedSequence(training.seed, spawn_key=(PLAN_STREAM,)))
