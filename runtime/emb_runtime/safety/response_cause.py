@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Final
 
@@ -56,13 +57,10 @@ def cause(bench: Bench, model: ResponseModel, rows: Sequence[Row], stop: Sequenc
 def _of_commands(model: ResponseModel, rows: Sequence[Row], stop: Sequence[Row], means: bool) -> str:
     """The likeliest age of the frames, or lag of the current."""
     braked, later = stop[:BRAKES], [age for age in range(OLDEST_FRAME + 1) if age != model.age]
-
-    def of(age: int, lag: float, seen: int = 0) -> float:
-        return deviance(model, rows, braked, age, lag, seen, means)
-
-    declared = of(model.age, 0.0)
-    ages = {age: min(of(age, 0.0, seen) for seen in range(age + 1)) for age in later}
-    flows = {lag: of(model.age, lag) for lag in LAGS}
+    deviance_of = partial(deviance, model, rows, braked, means=means)
+    declared = deviance_of(model.age, 0.0)
+    ages = {age: min(deviance_of(age, 0.0, seen) for seen in range(age + 1)) for age in later}
+    flows = {lag: deviance_of(model.age, lag) for lag in LAGS}
     aged, lagged = min(ages.values()), min(flows.values())
     if not min(aged, lagged) < declared - LIKELY:  # this way round, nothing fits where both are infinite
         return "" if not stop else _of_commands(model, rows, (), means)
