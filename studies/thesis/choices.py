@@ -43,11 +43,11 @@ def compared(
 
     A later call goes on with the rest.
     """
-    counts = []
+    counts, beside = [], [(choice, seed) for choice in GRID for seed in seeds]
     for seed in seeds:
         for figure in figures:
             for choice in GRID:
-                trainings = Trainings(folder, bench, (seed,), steps, tell, choice, until)
+                trainings = Trainings(folder, bench, (seed,), steps, tell, choice, until, beside)
                 try:
                     facts = agent_facts(figure, trainings)
                 except SpentError:

@@ -7,7 +7,7 @@ import math
 import pickle
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -25,8 +25,9 @@ from emb_train.closed_loop import Batch
 from emb_train.play import Draw, begin_all, middle_of
 from emb_train.ppo import DeployedActor
 from emb_train.rewards import REWARDS, Reward, transition
-from emb_train.training import BENCH, CONFIGURATION, METRICS, begin_training, load_preset, run_training
+from emb_train.training import BENCH, CONFIGURATION, METRICS, load_preset
 from emb_train.training import Training as Configuration
+from studies.thesis.stacked import train_together
 
 Floats = NDArray[np.float64]
 AGENT = "agent.pt"  # File of a training: what was learned
@@ -154,6 +155,7 @@ class Trainings:
         tell: Callable[[str], object],
         choice: Choice = PRESETS,
         until: float = math.inf,
+        beside: Sequence[tuple[Choice, int]] = (),
     ) -> None:
         """Keep trainings in a folder.
 
@@ -162,37 +164,59 @@ class Trainings:
             bench: what they train on.
             seeds: of trainings that are repeated; the first is that of all others.
             most: steps of a training, if that is fewer than its preset's.
-            tell: called with a line of text before a training begins.
+            tell: called with a line of text before trainings begin.
             choice: values that the thesis leaves open.
             until: time of :func:`time.monotonic` from which no training begins [s].
+            beside: choices and seeds of trainings that will be needed, too, and that are made at the same time.
         """
         self._folder, self._bench, self._most, self._tell = folder, bench, most, tell
-        self._choice, self._until = choice, until
+        self._choice, self._until, self._beside = choice, until, tuple(beside)
         self.seeds = tuple(seeds)
 
     def first(self, preset: str) -> Training:
         """The training with the first seed."""
-        return self._one(preset, self.seeds[0])
+        return self._of(preset, self.seeds[:1])[0]
 
     def all(self, preset: str) -> list[Training]:
         """One training for each seed."""
-        return [self._one(preset, seed) for seed in self.seeds]
+        return self._of(preset, self.seeds)
 
-    def _one(self, preset: str, seed: int) -> Training:
+    def _of(self, preset: str, seeds: Sequence[int]) -> list[Training]:
+        needed = [self._configured(preset, self._choice, seed) for seed in seeds]
+        missing = {folder: config for folder, config in needed if _to_be_made(folder, config)}
+        if missing:
+            conditions = needed[0][1].conditions
+            others = [self._configured(preset, *one) for one in self._beside]
+            missing |= {f: c for f, c in others if c.conditions == conditions and _to_be_made(f, c)}
+            self._make(missing)
+        return [self._read(folder, config) for folder, config in needed]
+
+    def _configured(self, preset: str, choice: Choice, seed: int) -> tuple[Path, Configuration]:
+        """Folder and configuration of a training."""
         config = load_preset(preset, seed=seed)
         if self._most is not None and self._most < config.ppo.total_steps:
             config = load_preset(preset, seed=seed, total_steps=self._most)
-        config = self._choice.applied(config, self._bench.limits.current)
-        folder = self._folder / self._choice.folder(config) / f"{preset}-{seed}"
-        if folder.exists() and _interrupted(folder, config):
-            shutil.rmtree(folder)
-        if not folder.exists():
-            if time.monotonic() > self._until:
-                raise SpentError("--minutes: the time is over before all trainings are made: the next call goes on")
-            self._tell(f"training {folder.relative_to(self._folder)}, {config.ppo.iterations * config.ppo.batch} steps")
-            begin_training(folder, config, self._bench)
-            *_, best = run_training(folder, config, self._bench)
-            torch.save(best.actor.state_dict(), folder / AGENT)
+        config = choice.applied(config, self._bench.limits.current)
+        return self._folder / choice.folder(config) / f"{preset}-{seed}", config
+
+    def _make(self, trainings: Mapping[Path, Configuration]) -> None:
+        if time.monotonic() > self._until:
+            raise SpentError("--minutes: the time is over before all trainings are made: the next call goes on")
+        names = ", ".join(str(folder.relative_to(self._folder)) for folder in trainings)
+        ppo = next(iter(trainings.values())).ppo
+        self._tell(f"training {names}, {ppo.iterations * ppo.batch} steps each")
+        for folder in trainings:
+            if folder.exists():
+                shutil.rmtree(folder)
+        for folder, actor in train_together(trainings, self._bench):
+            torch.save(actor.state_dict(), folder / AGENT)
+
+    def _read(self, folder: Path, config: Configuration) -> Training:
+        """A finished training.
+
+        Raises:
+            UsageError: the folder holds another one, or a file of it is damaged.
+        """
         if not _is_of(folder, config) or load_bench(folder / BENCH).identity_hash != self._bench.identity_hash:
             raise UsageError(f"{folder}: holds another training, of other steps or bench: choose another --output")
         records = _records(folder)
@@ -235,7 +259,9 @@ def _is_of(folder: Path, config: Configuration) -> bool:
     return same
 
 
-def _interrupted(folder: Path, config: Configuration) -> bool:
-    """True for a training of this configuration that has begun and was not finished."""
+def _to_be_made(folder: Path, config: Configuration) -> bool:
+    """True where there is no folder, or one of this training that was interrupted."""
+    if not folder.exists():
+        return True
     finished = (folder / AGENT).exists() and len(_records(folder)) == config.ppo.iterations
     return _is_of(folder, config) and not finished

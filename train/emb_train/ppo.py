@@ -24,7 +24,7 @@ from emb_bench.parallel import processors
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import EmbError
 from emb_runtime.policy.contract import SAMPLE
-from emb_train.closed_loop import Count, Positive, Share
+from emb_train.closed_loop import Batch, Count, Positive, Share
 from emb_train.env import EmbExcitationVectorEnv
 
 Result = TypeVar("Result")
@@ -420,7 +420,8 @@ def collect_all(
 
 def at_once(work: Callable[..., Result], *arguments: Sequence[Any]) -> list[Result]:
     """The results of work with several environments: while one steps, another may wait for processes."""
-    with ThreadPoolExecutor(processors()) as threads:
+    # A thread of its own has torch's number of threads again: one here, too.
+    with ThreadPoolExecutor(processors(), initializer=torch.set_num_threads, initargs=(1,)) as threads:
         return list(threads.map(work, *arguments))
 
 
@@ -484,10 +485,16 @@ def collect(env: EmbExcitationVectorEnv, actor: Actor, noise: Tensor, seeds: Seq
             final = info.get("final_info", info)
             strayed[t], homes[t] = (torch.from_numpy(over & final[name]) for name in ("violated", "home"))
     states[steps] = torch.from_numpy(info["critic"])
+    mean = mean_return(rewards, terminals, env.batch)
+    return Rollout(seen, states, actions, log_densities, rewards, terminals, strayed, homes, mean)
+
+
+def mean_return(rewards: Tensor, terminals: Tensor, batch: Batch) -> float:
+    """:attr:`Rollout.mean_return` of rewards and ends, shape [T, N]."""
+    steps, count = rewards.shape
     ended = int(terminals.sum())
-    complete = ended and steps >= env.batch.bench.timing.horizon
-    mean_return = float(rewards.sum()) / (ended if complete else env.num_envs + int(terminals[:-1].sum()))
-    return Rollout(seen, states, actions, log_densities, rewards, terminals, strayed, homes, mean_return)
+    complete = ended and steps >= batch.bench.timing.horizon
+    return float(rewards.sum()) / (ended if complete else count + int(terminals[:-1].sum()))
 
 
 def exploration_noise(steps: int, envs: int, noise_memory: float, generator: torch.Generator, hold: int = 1) -> Tensor:

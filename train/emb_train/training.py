@@ -227,24 +227,28 @@ def run_training(
         if training.plan is not None:
             stopped = follow_plan(folder, actor, training, training.plan, bench, pool, show)
         validation, best = Validation(training, bench, pool), -math.inf
-        every, last = max(1, training.ppo.iterations // VALIDATIONS), training.ppo.iterations
         if training.plan is not None:
             best = validation.score(actor)
-            _note(folder, {"iteration": 0, "steps": 0, "score": best})
+            note(folder, {"iteration": 0, "steps": 0, "score": best})
             yield Trained(copy.deepcopy(actor), 0, best)
             if stopped:
                 raise KeyboardInterrupt
         for metrics in train(envs, actor, training.ppo, training.seed):
-            validated = metrics.iteration in (1, last) or metrics.iteration % every == 0
-            score = validation.score(actor) if validated else None
-            _note(folder, asdict(metrics) | {"score": score})
+            score = validation.score(actor) if validated(metrics.iteration, training.ppo.iterations) else None
+            note(folder, asdict(metrics) | {"score": score})
             show(metrics)
             if score is not None and score > best:
                 best = score
                 yield Trained(copy.deepcopy(actor), metrics.iteration, score)
 
 
-def _note(folder: Path, record: dict[str, Any]) -> None:
+def validated(iteration: int, iterations: int) -> bool:
+    """True after the iterations of a training in which its actor is validated."""
+    return iteration in (1, iterations) or iteration % max(1, iterations // VALIDATIONS) == 0
+
+
+def note(folder: Path, record: dict[str, Any]) -> None:
+    """Write a line of a training's progress."""
     with (folder / METRICS).open("a", encoding="utf-8") as file:
         file.write(json_document(record) + "\n")
 
