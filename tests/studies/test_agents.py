@@ -15,7 +15,7 @@ import scipy.stats
 from emb_bench.config.bench import load_bench
 from emb_runtime.safety.shield_design import make_law
 from emb_train.play import Draw
-from emb_train.training import CONFIGURATION, METRICS, Training, load_preset
+from emb_train.training import CONFIGURATION, METRICS, Training, begin_training, load_preset, run_training
 from studies.thesis import agents, choices, pictures, trainings
 from studies.thesis.agents import (
     FIGURES,
@@ -31,6 +31,7 @@ from studies.thesis.agents import (
     ways_home,
 )
 from studies.thesis.cli import TRAININGS, main
+from studies.thesis.stacked import train_together
 from studies.thesis.trainings import AGENT, Trainings
 from tests.commands import refused
 
@@ -63,7 +64,7 @@ def made(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Trainings:
         raise AssertionError("trained again")
 
     monkeypatch.setattr(trainings, "load_preset", small)
-    monkeypatch.setattr(trainings, "run_training", refuse)
+    monkeypatch.setattr(trainings, "train_together", refuse)
     return Trainings(folder, BENCH, (0, 1), None, lambda _: None)
 
 
@@ -81,6 +82,27 @@ def test_every_target_has_statements_of_its_own_trainings_which_are_made_once(
     assert sorted(path.name for path in folder.iterdir()) == sorted(names)
     assert main(["fig-5.2", "fig-4.2", "--output", str(folder)]) == 0
     assert capsys.readouterr().out.count("fig-") == 2
+
+
+def test_trainings_at_once_are_those_alone_but_for_rounding(tmp_path: Path) -> None:
+    sizes = {"total_steps": 2000, "envs": 2, "rollout": 500, "minibatch": 250, "epochs": 2, "hidden": [8, 8]}
+    together = {
+        tmp_path / f"{deviation}-{seed}": trainings.Choice(deviation=deviation).applied(
+            load_preset("thesis-trajectory-b", seed=seed, **sizes), BENCH.limits.current
+        )
+        for deviation in (1.0, 6.0)
+        for seed in (0, 1)
+    }
+    actors = dict(train_together(together, BENCH))
+    for folder, config in together.items():
+        begin_training(alone := tmp_path / f"{folder.name}-alone", config, BENCH)
+        *_, best = run_training(alone, config, BENCH)
+        for ours, its in zip(actors[folder].parameters(), best.actor.parameters(), strict=True):
+            np.testing.assert_allclose(ours.detach(), its.detach(), atol=1e-5)
+        lines = [[json.loads(line) for line in (f / METRICS).read_text().splitlines()] for f in (folder, alone)]
+        for ours, its in zip(*lines, strict=True):
+            assert ours == pytest.approx({name: its[name] for name in ours}, rel=1e-3)
+    assert len({float(actor.log_deviation) for actor in actors.values()}) == 4
 
 
 def test_a_wrong_option_is_refused_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
