@@ -102,7 +102,7 @@ def test_trainings_at_once_are_those_alone_but_for_rounding(tmp_path: Path) -> N
         lines = [[json.loads(line) for line in (f / METRICS).read_text().splitlines()] for f in (folder, alone)]
         for ours, its in zip(*lines, strict=True):
             assert ours == pytest.approx({name: its[name] for name in ours}, rel=1e-3)
-    assert len({float(actor.log_deviation) for actor in actors.values()}) == 4
+    assert len({float(actor.log_deviation.detach()) for actor in actors.values()}) == 4
 
 
 def test_a_wrong_option_is_refused_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
