@@ -51,7 +51,10 @@ class Stack(nn.Module):
         *hidden, (to_output, bias) = zip(self.weights, self.biases, strict=True)
         for weight, shift in hidden:
             x = self.tanh(torch.baddbmm(shift, x, weight))
-        return (x * to_output.mT).sum(2, keepdim=True) + bias  # a product of matrices takes four times as long
+        output: Tensor = (x * to_output.mT).sum(
+            2, keepdim=True
+        ) + bias  # a product of matrices takes four times as long
+        return output
 
     def write(self, k: int, network: nn.Sequential) -> None:
         """Write the weights of the k-th into a network."""
@@ -181,7 +184,8 @@ def improve(
 
     def by_member(of_steps: Tensor) -> Tensor:
         """Shape [T, K N, ...] to [K, T N, ...]."""
-        return of_steps.unflatten(1, (count, -1)).transpose(0, 1).flatten(1, 2)
+        steps, width, *rest = of_steps.shape
+        return of_steps.view(steps, count, width // count, *rest).transpose(0, 1).flatten(1, 2)
 
     with torch.no_grad():
         values = critic(by_member(rollout.states)).view(count, len(rollout.states), -1).transpose(0, 1).flatten(1)
