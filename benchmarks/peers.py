@@ -216,7 +216,7 @@ def judged(program: str, fit: Fit, right: bool, theta: Floats) -> Outcome:
 
 def report(some: list[Outcome]) -> None:
     """The rows of one program and one kind of model."""
-    print(f"\n{some[0].program}, {'right models' if some[0].right_model else 'near misses'}: {len(some)} logs")
+    print(f"\n{some[0].program}, {'right models' if some[0].right_model else 'misspecified models'}: {len(some)} logs")
     print("  95 % intervals cover               ", share(sum(o.covered for o in some), 4 * len(some)))
     print("  called usable                      ", share(sum(o.usable for o in some), len(some)))
     print("  usable and wrong                   ", share(sum(o.usable and o.wrong for o in some), len(some)))

@@ -2,8 +2,8 @@
 
 mkdocs calls :func:`on_config` and :func:`on_files` at each build. ``reference/modules/`` has a page for each
 sub-package and module of the four packages, ``reference/commands.md`` the ``--help`` of every command and sub-command.
-The tables of rooms, CAN messages and log topics and the advice for faults replace a marker in pages that are written by
-hand.
+The tables of sub-packages, CAN messages and log topics and the advice for faults replace a marker in pages that are
+written by hand.
 """
 
 from __future__ import annotations
@@ -84,10 +84,10 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
 
 
 def rooms_table() -> str:
-    """A table of the rooms, lowest first, each with the first paragraph of its docstring."""
+    """A table of the sub-packages, lowest first, each with the first paragraph of its docstring."""
     order = ast.parse((ROOT / "tests/properties/test_import_direction.py").read_text(encoding="utf-8"))
     (found,) = (n.value for n in order.body if isinstance(n, ast.Assign) and ast.unparse(n.targets[0]) == "ROOMS")
-    lines = ["| room | what it is for |", "|---|---|"]
+    lines = ["| sub-package | what it is for |", "|---|---|"]
     for package, names in ast.literal_eval(found).items():
         lines.append(f"| **{Path(package).name}** | {first_line(Path(package))} |")
         lines += [f"| `{name}` | {first_line(Path(package) / name)} |" for name in names.split()]

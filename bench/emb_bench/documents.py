@@ -1,4 +1,4 @@
-"""Records by name: JSON documents, whose keys are the names of the fields, and mappings that know what was meant."""
+"""Records as JSON documents, whose keys are the names of the fields, and mappings that suggest the intended name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that a command makes: refused before a long piece of work, written as a whole, or left as they were."""
+"""Output files of a command: checked before a long computation, then replaced as a whole or left unchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Work shared out to processes of this machine or to Ray.
+"""Work distributed over processes of this machine or over Ray.
 
 A process that dies, out of memory or in a fault of compiled code, costs its own piece of work and no other: each has a
 pipe of its own and one piece at a time, so that it is known which one that was, whenever the process died.

@@ -1,4 +1,4 @@
-"""A run again from its log: its inputs go into the same core, and what the core records is compared with the log.
+"""Rerun of a log: the same core gets the recorded inputs, and its new records are compared with the log.
 
 Inputs are the frames, each read with its time, and the calls in ``/input``. The core records each before what comes of
 it: the order of the log is that of the core's records.

@@ -1,4 +1,4 @@
-"""Export of currents or a network to one ONNX file with its contract, and the proof that both compute the same."""
+"""Export of currents or a network to one ONNX file with its contract, and the check that both compute the same."""
 
 from __future__ import annotations
 

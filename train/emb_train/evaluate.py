@@ -1,4 +1,4 @@
-"""Evaluation: policies and reference excitations on the same fresh brakes with the same noise, paired by brake."""
+"""Evaluation: policies and reference excitations on the same new brakes with the same noise, paired by brake."""
 
 from __future__ import annotations
 

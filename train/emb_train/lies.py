@@ -1,9 +1,10 @@
-"""Clearness with which the motion of an experiment shows that a node lies.
+"""Detectability of a faulty node by the motion of an experiment.
 
-The runtime ends a run whose motion is that of no one brake (:mod:`emb_runtime.safety.motion_balance`). Whether it can
-tell depends on the excitation: a scale that slides is seen in long strokes, not in a creep. Here the record of an
-honest experiment is changed as a lie changes it, and the balance judges it. The loop follows what the node tells: with
-a wrong sensor the reported motion stays, and the true one changes with its currents.
+The runtime ends a run whose motion no single brake explains (:mod:`emb_runtime.safety.motion_balance`). Whether this
+test detects a fault depends on the excitation: a scale that drifts is detected in long strokes, not in slow motion.
+Here the record of a fault-free experiment is changed as the fault would change it, and the balance tests it. The loop
+follows the reported values: with a wrong sensor the reported motion stays the same, and the true motion and its
+currents change.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ SWING = 10.0 * np.pi  # Angular frequency of a swinging scale [rad/s]
 
 
 class Record(NamedTuple):
-    """Record of n periods of the length ``ts`` [s], as it is or as a node that lies would leave it."""
+    """Record of n periods of the length ``ts`` [s], as measured, or as a faulty node would cause it."""
 
     ts: float
     brake: BrakeParameters  # The true one
@@ -75,11 +76,11 @@ LIES: Mapping[str, Callable[[Record], Record]] = {
         -0.5 * r.brake.gamma * r.brake.k_1 * np.maximum(r.x[1:], 0.0) * (r.within > 0.25)
     ),
 }
-"""The changes of a record by the lies of a node, by name."""
+"""The changes of a record by faults of a node, by name."""
 
 
 def clearness(bench: Bench, brakes: list[BrakeParameters], motion: Floats, currents: Floats) -> Floats:
-    """Motion that each lie leaves unexplained in each of N experiments, as a share of what an honest run may leave.
+    """Unexplained velocity by each fault in each of N experiments, as a share of the limit for a fault-free run.
 
     Args:
         bench: of the experiments.
@@ -88,8 +89,8 @@ def clearness(bench: Bench, brakes: list[BrakeParameters], motion: Floats, curre
         currents: those that acted [A], shape [N, n].
 
     Returns:
-        Shape [N, lies]: a run with this lie is ended where it is above 1; 0 where too little moves to be judged, and
-        infinite on a bench whose runs are never judged.
+        Shape [N, faults]: above 1 the fault ends the run; 0 where the motion is too small for a verdict; infinite on a
+        bench whose runs have no verdict.
     """
     model, ts, found = balance_model(bench), bench.timing.sample_time, np.full((len(brakes), len(LIES)), np.inf)
     if model.allowed == math.inf:

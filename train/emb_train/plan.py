@@ -1,13 +1,14 @@
 """Search for a plan of speeds for unknown brakes: a few levels and their times, by CMA-ES.
 
-A plan holds n levels of speed, for a time each, and then the shield brings the brake home; it depends on no
-measurement. Its 2 n numbers lie within ±1: the signed root of each level, so that a creep of some rad/s is as wide as
-a full stroke, and the logarithm of each time, so that the levels keep their order. The landscape has many tops, and
-most plans say nothing at all: plans of full strokes and creeps are drawn, and CMA-ES (Hansen and Ostermeier, Completely
-derandomized self-adaptation in evolution strategies, Evolutionary Computation 9, 2001) improves the best of them with
-the same brakes in each step, one set for each environment. Again and again the worse half of the searches ends, and the
-others go on with twice the brakes (Jamieson and Talwalkar, Non-stochastic best arm identification and hyperparameter
-optimization, AISTATS 2016): what is best on few brakes is not best on others.
+A plan has n speed levels, each held for a time; then the shield brings the brake home. It does not depend on the
+measurements. Its 2 n numbers are within ±1: the signed root of each level, so that slow motions of some rad/s have the
+same width as full strokes, and the logarithm of each time, so that the levels keep their order. The return has many
+local maxima, and most plans give no information at all. So plans of full strokes and slow motions are drawn, and CMA-ES
+(Hansen and Ostermeier, Completely derandomized self-adaptation in evolution strategies, Evolutionary Computation 9,
+2001) improves the best of them with the same brakes in each step, one set for each environment. Repeatedly the worse
+half of the searches ends, and the others continue with twice as many brakes (Jamieson and Talwalkar, Non-stochastic
+best arm identification and hyperparameter optimization, AISTATS 2016): the best plan for few brakes is not the best for
+others.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class PlanSearch(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     brakes: Count = 16  # Of each plant, on which the plans of the last search are compared
     levels: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 9  # Of a plan; seven nearly suffice
     spread: Positive = 0.15  # First standard deviation of its numbers, -1 to 1, in CMA-ES
-    hidden: Price | None = None  # Price of what a lie is short of [nat]; None: that of the demands, which PPO pays
+    hidden: Price | None = None  # Penalty for an undetected fault in the search [nat]; None: that of the demands
 
     @property
     def rounds(self) -> int:

@@ -212,17 +212,17 @@ def _explored(t: Transition, back: Floats) -> Floats:
 
 
 class Demands(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Demands on an experiment besides its information, and the prices where it does not meet them.
+    """Demands on an experiment besides its information, with the penalties for each demand that is not met.
 
-    A sensor that lies moves a brake by some radians before it is found out: there is to be room on the side of the
-    release. And the motion is to show that a node lies (:mod:`emb_train.lies`).
+    A faulty sensor moves a brake by some radians before it is detected, so the experiment keeps a distance on the side
+    of the release. And the motion has to reveal a faulty node (:mod:`emb_train.lies`).
     """
 
-    astray: Price = 20.0  # Price of violated limits, or of an end away from home [nat]
-    release: Share = 0.3  # Part of the way to the lowest angle that is free
-    beyond: Price = 1.0  # Price of each radian beyond it [nat]
-    shown: Price = 1.15  # How clearly the motion shows each lie; above 1 a run is ended
-    hidden: Price = 10.0  # Price of each unit that a lie is short of that [nat]
+    astray: Price = 20.0  # Penalty for violated limits, or for an end away from home [nat]
+    release: Share = 0.3  # Share of the distance to the lowest angle without a penalty
+    beyond: Price = 1.0  # Penalty for each radian beyond it [nat]
+    shown: Price = 1.15  # Required detectability of each fault; above 1 the fault ends a run
+    hidden: Price = 10.0  # Penalty for each unit below it [nat]
 
 
 DEMANDS = Demands()
@@ -232,7 +232,7 @@ DEMANDS = Demands()
 class ExpectedInterval:
     """Reward of an experiment, in its last step [nat]: the criterion of the interval that an estimate will have.
 
-    Without a discount it is the sum of the criterion's increments. What the experiment pays is taken off.
+    Without a discount it is the sum of the criterion's increments. The penalties of the experiment are subtracted.
     """
 
     criterion: IntervalCriterion
