@@ -1,14 +1,25 @@
+"""The Euler brake beside torch's autograd; each brake is moved by its own solver."""
+
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
 
-from emb_bench.brake.euler import sensitivity_step, sign, step, stiffness
-from emb_bench.brake.parameters import F_V
+from emb_bench.brake.euler import advance_euler, sensitivity_step, sign, step, stiffness
+from emb_bench.brake.exact import advance_exact
+from emb_bench.brake.extended import advance_extended
+from emb_bench.brake.motion import SENSITIVE, STATES, Floats, advance, no_sensitivity, rest
+from emb_bench.brake.parameters import FEATURES as NAMED
+from emb_bench.brake.parameters import PARAMETERS
+from emb_bench.config.plants import DIRECTED, EULER, EXACT, Mechanics
 from emb_runtime.config.bench import load_bench
 
 NOMINAL = load_bench().brake
@@ -62,29 +73,92 @@ def test_sensitivities_are_those_of_torch_autograd_along_any_trajectory(
     torch.testing.assert_close(torch.tensor(found, dtype=torch.float64).T, expected, rtol=1e-10, atol=1e-12)
 
 
-def viscous_sensitivity(velocity_until: float) -> list[float]:
-    """Sensitivity of the angle to f_v, in contact, at 500 rad/s until a time [s] and at rest after it (Fig. 5.1)."""
-    s1 = s2 = 0.0
-    history = []
-    for k in range(500):
-        x2 = 500.0 if k * T_S < velocity_until else 0.0
-        s1, s2 = sensitivity_step(NOMINAL, 1.0, x2, 0.0, T_S, s1, s2, F_V)
-        history.append(s1)
-    return history
+BENCH = load_bench()
+P = BENCH.brake
+NAMES = ("k_m", "k_1", "x1_0")
+FEATURES = {
+    "break_away": 1.2,
+    "stribeck_velocity": 30.0,
+    "f_l": 1e-6,
+    "quadratic": 0.001,
+    "cubic": 1e-5,
+    "hysteresis": 0.1,
+    "current_lag": 0.002,
+    "play": 0.3,
+    "viscous_asymmetry": -0.2,
+}
 
 
-def test_at_constant_full_speed_the_angle_sensitivity_peaks_where_figure_5_1_has_it() -> None:
-    history = [abs(s) for s in viscous_sensitivity(velocity_until=1.0)]
-    peak = history.index(max(history))
-    assert (peak + 1) * T_S == pytest.approx(0.34, abs=0.01)
-    # Steady state f_v·500/(γ k_1), exceeded by the overshoot of ζ = 0.2407, which Euler's negative damping raises.
-    steady = NOMINAL.f_v * 500.0 / (NOMINAL.gamma * NOMINAL.k_1)
-    overshoot = math.exp(-math.pi * 0.2407 / math.sqrt(1.0 - 0.2407**2))
-    assert history[peak] == pytest.approx(steady * (1.0 + overshoot), rel=0.02)
+def start() -> Floats:
+    return np.array([5.0, 20.0, 0.0, 1.0])
 
 
-def test_after_the_motor_stops_information_still_rises_once_more_as_in_figure_5_1() -> None:
-    history = [s * s for s in viscous_sensitivity(velocity_until=0.2)]
-    valley = min(range(200, 500), key=history.__getitem__)
-    assert history[valley] < 0.001 * max(history)
-    assert max(history[valley:]) > 0.05 * max(history)
+def advance_directed(m: Mechanics, p: Any, x: Floats, u: float, t_s: float, chosen: Any, s: Floats) -> None:
+    advance_exact(p, x, u, t_s, chosen, s, m.viscous_asymmetry)
+
+
+def moved(m: Mechanics) -> tuple[Floats, Floats]:
+    x, (chosen, s) = start(), no_sensitivity(NAMES)
+    advance(m, P, x, 2.0, T_S, chosen, s)
+    return x, s
+
+
+def with_feature(name: str) -> Mechanics:
+    return Mechanics(**(Mechanics(EXACT)._asdict() | {name: FEATURES[name]}))
+
+
+@pytest.mark.parametrize(
+    ("m", "solver"),
+    [
+        (Mechanics(EULER), lambda _, *arguments: advance_euler(*arguments)),
+        (Mechanics(EXACT), lambda _, *arguments: advance_exact(*arguments)),
+        *((with_feature(name), advance_extended) for name in FEATURES if name != DIRECTED),
+        (with_feature(DIRECTED), advance_directed),
+        (Mechanics(EXACT, tolerance=1e-11), lambda _, *arguments: advance_exact(*arguments)),
+    ],
+)
+def test_each_brake_is_moved_by_its_own_solver(m: Mechanics, solver: Callable[..., None]) -> None:
+    x, (chosen, s) = start(), no_sensitivity(NAMES)
+    solver(m, P, x, 2.0, T_S, chosen, s)
+    assert_array_equal(moved(m)[0], x)
+    assert_array_equal(moved(m)[1], s)
+
+
+def test_friction_by_direction_has_the_sensitivities_of_central_differences() -> None:
+    """Over turns of the motion, each way of which has a viscous friction of its own."""
+
+    def run(asymmetry: float, names: tuple[str, ...] = ()) -> tuple[Floats, Floats]:
+        x, (chosen, s), seen = start(), no_sensitivity(names), []
+        for k in range(60):
+            current = 2.0 if k % 20 < 10 else -2.0
+            advance(Mechanics(EXACT, viscous_asymmetry=asymmetry), P, x, current, T_S, chosen, s)
+            seen.append(x[:2].copy())
+        return np.array(seen), s
+
+    (_, s), step = run(0.3, ("viscous_asymmetry", "f_v")), 1e-6
+    difference = (run(0.3 + step)[0][-1] - run(0.3 - step)[0][-1]) / (2.0 * step)
+    np.testing.assert_allclose(s[0, :2], difference, rtol=1e-5, atol=1e-6)
+    slower, faster = run(0.5)[0], run(-0.5)[0]
+    assert slower[9, 1] < run(0.0)[0][9, 1] < faster[9, 1]  # tightening has more friction, or less
+
+
+def test_at_the_start_only_the_initial_state_is_sensitive_to_itself() -> None:
+    _, s = no_sensitivity(("x2_0", "k_m", "x1_0"))
+    assert rest().shape == (STATES,)
+    assert s.shape == (3, SENSITIVE)
+    assert_array_equal(s, [[0, 1, 0, 0], [0, 0, 0, 0], [1, 0, 0, 0]])
+    with pytest.raises(ValueError, match="no_such_thing"):
+        no_sensitivity(("no_such_thing",))
+
+
+def test_each_feature_of_the_mechanics_has_a_row_with_what_its_readers_take() -> None:
+    shaping = {"solver", "stribeck_exponent", "hysteresis_travel", "tolerance"}  # say how, not how much
+    assert set(Mechanics._fields) - shaping - set(PARAMETERS) == set()
+    assert set(NAMED) < set(Mechanics._fields)
+    for name, row in PARAMETERS.items():
+        assert row.unit, name
+        assert row.low <= row.start <= row.high or row.start == 0.0, name
+        assert row.low < row.high or name not in NAMED, name
+        assert bool(row.effect) == bool(row.remedy), name
+        assert row.step == 0.0 or name in NAMED, name
+        assert row.gross > 0.0, name

@@ -1,6 +1,9 @@
+"""Criteria of an information matrix, dense and packed, beside dense linear algebra, singular ones and many at once."""
+
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -10,7 +13,14 @@ from hypothesis import strategies as st
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.information.criteria import criteria, criteria_series
 from emb_bench.information.identifiability import Doubt, Spectrum, combination, identifiability, schur_complement
-from emb_bench.information.symmetric import Floats
+from emb_bench.information.symmetric import (
+    Floats,
+    add_increment,
+    lambda_min,
+    log_det,
+    pack,
+    trace_inverse,
+)
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 
@@ -203,3 +213,59 @@ def test_each_matrix_has_the_numbers_that_it_has_alone(
     np.testing.assert_allclose(series.log_det, [c.log_det for c in alone], rtol=1e-7, atol=1e-6)
     np.testing.assert_allclose(series.lambda_min, [c.lambda_min for c in alone], rtol=1e-6)
     np.testing.assert_allclose(series.trace_inverse, [c.trace_inverse for c in alone], rtol=1e-6)
+
+
+def badly_scaled(seed: int, n: int) -> tuple[Floats, Floats]:
+    """A random positive definite matrix with scales over eight decades, and its inverse by way of the scaled one."""
+    rng = np.random.default_rng(seed)
+    half = rng.normal(size=(n, n + 2))
+    scale = 10.0 ** rng.uniform(-4.0, 4.0, n)
+    core = half @ half.T
+    return core * np.outer(scale, scale), np.linalg.inv(core) / np.outer(scale, scale)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4))
+def test_the_criteria_are_those_of_dense_linear_algebra_whatever_the_scales(seed: int, n: int) -> None:
+    matrix, inverse = badly_scaled(seed, n)
+    m, work = pack(matrix), np.full((n, n), np.nan)
+    assert log_det(m, work) == pytest.approx(-np.linalg.slogdet(inverse)[1], abs=1e-6)
+    assert trace_inverse(m, work) == pytest.approx(np.trace(inverse), rel=1e-6)
+    assert lambda_min(m, work) == pytest.approx(1.0 / np.linalg.eigvalsh(inverse)[-1], rel=1e-6)
+    np.testing.assert_array_equal(m, pack(matrix))
+
+
+def test_a_small_eigenvalue_beside_a_large_one_loses_no_digit_to_cancellation() -> None:
+    # Half the trace less the root of the discriminant would give 2.0 or 0.0 here, whatever the small entry.
+    assert lambda_min(np.array([1e16, 0.0, 1.2345]), np.empty((2, 2))) == pytest.approx(1.2345, rel=1e-14)
+    large, off, small = Fraction(10**12), Fraction(10**5), Fraction(3, 100)
+    exact = (large * small - off * off) / large  # |M| / λ_max, λ_max being `large` to 1e-14
+    found = lambda_min(np.array([1e12, 1e5, 0.03]), np.empty((2, 2)))
+    assert found == pytest.approx(float(exact), rel=1e-13)
+    assert lambda_min(pack(np.diag([1e14, 1e7, 1.2345])), np.empty((3, 3))) == pytest.approx(1.2345, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        np.zeros((3, 3)),
+        np.ones((3, 3)),
+        np.diag([1.0, 0.0, 1.0]),
+        np.diag([1.0, -1.0, 1.0]),
+        np.full((3, 3), np.nan),
+        np.diag([1.0, np.nan, 1.0]),
+        np.diag([1.0, np.inf, 1.0]),
+    ],
+    ids=["zero", "rank one", "zero pivot", "indefinite", "nan", "nan on the diagonal", "infinite"],
+)
+def test_a_matrix_that_tells_nothing_certain_has_the_worst_values_and_never_nan(matrix: Floats) -> None:
+    m, work = pack(matrix), np.empty((3, 3))
+    assert (log_det(m, work), trace_inverse(m, work), lambda_min(m, work)) == (-math.inf, math.inf, 0.0)
+
+
+def test_what_rounding_leaves_of_a_singular_sum_counts_as_singular() -> None:
+    rng = np.random.default_rng(3)
+    m = np.zeros(3)
+    for s in rng.normal(size=(500, 2)):
+        add_increment(m, np.array([s, 0.3 * s]), 1e6, 1.0)  # the second parameter always does 0.3 of the first
+    assert log_det(m, np.empty((2, 2))) == -math.inf
+    assert m[0] * m[2] - m[1] * m[1] != 0.0  # a determinant in floating point would have had a logarithm, or NaN

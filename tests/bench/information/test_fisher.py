@@ -1,7 +1,10 @@
+"""Fisher information of currents and records, beside finite differences and the spread of estimates."""
+
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,9 +12,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Instruments
-from emb_bench.experiment.experiment import planned
-from emb_bench.experiment.simulate import Theta, simulate
+from emb_bench.experiment.experiment import Experiment, planned
+from emb_bench.experiment.simulate import NO_ERRORS, SystematicErrors, Theta, simulate
+from emb_bench.information.evaluation import Fit, Question, information_and_fit
+from emb_bench.information.evaluation import expected as expected_of
 from emb_bench.information.fisher import (
     Fisher,
     Kind,
@@ -48,11 +54,6 @@ def of(
     return fisher(BENCH, p, currents, kind=kind, params=params, plant=BENCH.plant(plant), **more)
 
 
-def test_the_weights_are_those_of_the_thesis_and_of_the_sensors() -> None:
-    assert thesis_weights(BENCH.noise, BENCH.limits) == pytest.approx((100.0, 1.0 / 250000.0), rel=1e-12)
-    assert physical_weights(BENCH.noise) == pytest.approx((1e6, 1.0), rel=1e-12)
-
-
 @pytest.mark.parametrize(("kind", "scale"), [("physical", (1.0, 1.0)), ("weighted", (100.0, 500.0))])
 def test_the_fisher_information_is_the_sum_of_the_outer_products(kind: Kind, scale: tuple[float, float]) -> None:
     s = of_euler(square(20, 4.0)) / np.array(scale)
@@ -78,13 +79,6 @@ def test_what_is_not_told_has_an_infinite_bound_and_the_others_keep_theirs() -> 
     assert (bounds["k_m"], bounds["T_c"]) == (math.inf, math.inf)
     # The two that look alike are one parameter's worth of doubt, whichever of the two is kept.
     assert (bounds["k_1"], bounds["f_v"]) == pytest.approx((told["k_1"], told["f_v"]), rel=1e-5)
-
-
-def test_a_brake_at_rest_tells_nothing() -> None:
-    found = of(np.zeros(500), plant="euler")
-    assert found.cramer_rao() == dict.fromkeys(PARAMETER_NAMES, math.inf)
-    assert found.criteria().log_det == -math.inf
-    assert len(found.criteria().flat) == 4
 
 
 def test_knowing_a_range_of_fifty_percent_is_worth_twelve_and_bounds_what_a_resting_brake_does_not() -> None:
@@ -227,11 +221,6 @@ def test_an_error_of_the_sampling_instant_is_worth_what_the_output_changes_in_it
     assert of(chirp(), plant="jitter").criteria().log_det < of(chirp()).criteria().log_det - 3.0
 
 
-def test_the_velocity_of_an_observer_is_no_measurement_of_its_own() -> None:
-    s = simulate(EXACT, Theta(BRAKE), planned(chirp()), T_S, PARAMETER_NAMES).sensitivities[:, :, 0]
-    np.testing.assert_allclose(of(chirp(), plant="observer").matrix, s.T @ s / BENCH.noise.angle**2, rtol=1e-11)
-
-
 def test_two_estimates_that_replace_each_other_are_called_traded_off() -> None:
     found = of(square(10, 6.0))
     correlation = found.correlation()
@@ -251,3 +240,84 @@ def test_a_value_that_cannot_be_told_from_the_end_of_its_range_is_at_a_border() 
     ):
         verdict = of(chirp(), p=BRAKE._replace(k_1=k_1)).identifiability(BENCH.range_set("viscous-stiffness"))
         assert {f.name: f.border for f in verdict.findings} == {"k_m": None, "k_1": expected, "T_c": None, "f_v": None}
+
+
+FINE = 20  # Steps of the simulation in a period
+CURRENTS = np.repeat([2.0, -1.5, 1.0, 0.3], 20)
+
+
+def shown(
+    bench: Bench, late: int = 0, offset: float = 0.0, current_offset: float = 0.0, gain: float = 0.0
+) -> Experiment:
+    """What the sensors of a brake show without noise, simulated in short steps.
+
+    Args:
+        bench: the brake.
+        late: by which each command acts late, or its sample is taken late if negative [steps].
+        offset: of the encoder [rad].
+        current_offset: acts besides [A].
+        gain: relative error of the velocity's scale.
+    """
+    acted = np.concatenate([np.zeros(max(late, 0)), np.repeat(CURRENTS, FINE)]) + current_offset
+    plant, t_s = bench.plant("exact"), bench.timing.sample_time
+    fine = simulate(plant, Theta(bench.brake), planned(acted), t_s / FINE).states
+    at = np.arange(FINE, len(CURRENTS) * FINE, FINE)
+    x = fine[at - min(late, 0)]
+    return Experiment("", CURRENTS[: len(x)], x * [1.0, 1.0 + gain] + [offset, 0.0], 0.0, 0.0, 0.0, True)
+
+
+def evaluated(bench: Bench, run: Experiment, errors: SystematicErrors, *names: str) -> tuple[Floats, Fit]:
+    """The physical information of an experiment that is evaluated in parts, and the fit."""
+    theta, last = Theta(bench.brake, errors=errors), [run.periods - 1]
+    histories, fit = information_and_fit(bench, bench.plant("exact"), theta, run, names, instants=last, piece=30)
+    return histories["physical"][-1], fit
+
+
+@pytest.mark.parametrize(
+    ("simulated", "errors", "most"),
+    [
+        ({"late": 6}, SystematicErrors(delay=0.3), 1e-6),
+        ({"offset": 0.04}, SystematicErrors(offset=0.04), 1e-6),
+        ({"current_offset": 0.05}, SystematicErrors(current_offset=0.05), 1e-6),
+        ({"gain": 0.02}, SystematicErrors(velocity_gain=0.02), 1e-6),
+        (
+            {"late": 6, "offset": -0.04, "current_offset": 0.05, "gain": -0.02},
+            SystematicErrors(-0.04, 0.05, 0.3, -0.02),
+            1e-6,
+        ),
+        ({"late": -1}, SystematicErrors(delay=-0.05), 0.2),  # to first order
+    ],
+)
+def test_a_record_is_explained_with_its_systematic_errors_only(
+    bench: Bench, simulated: dict[str, Any], errors: SystematicErrors, most: float
+) -> None:
+    piece = shown(bench, **simulated)
+    (_, explained), (_, alone) = (evaluated(bench, piece, each, "k_m") for each in (errors, NO_ERRORS))
+    assert max(explained.compared) < most
+    assert max(alone.compared) > 1.0
+
+
+def test_the_information_about_systematic_errors_is_that_of_finite_differences(bench: Bench) -> None:
+    at: dict[str, Any] = {"late": 6, "offset": 0.01, "current_offset": 0.05, "gain": 0.02}
+    steps = {"delay": ("late", 1, 1 / FINE), "current_offset": ("current_offset", 1e-4, 1e-4)}
+    steps |= {"offset": ("offset", 1e-4, 1e-4), "velocity_gain": ("gain", 1e-4, 1e-4)}
+    rows = []
+    for option, step, size in steps.values():
+        more, less = (shown(bench, **at | {option: at[option] + sign * step}) for sign in (1, -1))
+        derivative = (more.samples - less.samples) / (2.0 * size)
+        rows.append((derivative / [bench.noise.angle, bench.noise.velocity]).ravel())
+    found, _ = evaluated(bench, shown(bench, **at), SystematicErrors(0.01, 0.05, 0.3, 0.02), *steps)
+    expected = np.array(rows) @ np.array(rows).T
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(found / scale, expected / scale, atol=1e-3)
+
+
+@pytest.mark.parametrize("errors", [NO_ERRORS, SystematicErrors(offset=-0.7)])
+def test_a_planned_experiment_begins_at_the_origin_whatever_the_encoder_reads_there(
+    bench: Bench, errors: SystematicErrors
+) -> None:
+    exact = bench.plant("exact")
+    shifted = replace(exact, instruments=exact.instruments._replace(encoder_offset=0.4))
+    found, right = (expected_of(bench, one, Question(), bench.brake, errors, CURRENTS) for one in (shifted, exact))
+    assert found.trajectory.states.tolist() == right.trajectory.states.tolist()
+    assert found.matrix.tolist() == right.matrix.tolist()

@@ -1,9 +1,11 @@
-"""Delays, offset, jitter and the observer, against closed forms and brute force."""
+"""Delays, offset, jitter and the observer, against closed forms and brute force; simulation in open loop."""
 
 from __future__ import annotations
 
-import itertools
 import math
+import subprocess
+import sys
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,10 +13,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_bench.config.bench import Bench
+from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import LONGEST_DELAY, Instruments
+from emb_bench.experiment.experiment import planned
+from emb_bench.experiment.simulate import SystematicErrors, Theta, simulate, simulate_apart
 from emb_bench.sim.instruments import MEMORY, Tracked, command, measure, observe, observer_noise, settle
+from emb_bench.sim.open_loop import march
+from emb_runtime.errors import UsageError
 from emb_runtime.estimator.observer import DAMPING, observer_gains
+from tests.bench.flows import ALL, square
 
 T_S = 1e-3
 finite = st.floats(-1e3, 1e3)
@@ -128,21 +135,51 @@ def test_the_observer_works_on_the_measured_angle_with_its_noise_offset_and_jitt
         assert velocity == alone.velocity
 
 
-def test_every_instrument_at_once_is_the_same_compiled() -> None:
-    from emb_bench.compiled import compiled
+BENCH = load_bench()
+BRAKE = BENCH.brake
+EULER = BENCH.plant("euler")
+EXACT = BENCH.plant("exact")
 
-    everything = Instruments(2, 3, 0.1, 1e-5, 900.0)
-    rows: list[list[Any]] = []
-    for translate in (lambda fn: fn, compiled):
-        sense, act, begin = translate(measure), translate(command), translate(settle)
-        memory = np.zeros(MEMORY)
-        begin(everything, memory, 0.0)
-        values = np.random.default_rng(2).standard_normal((60, 5))
-        rows.append(
-            [
-                (act(everything, memory, u), *sense(everything, memory, T_S, x1, x2, 10.0, 1e-5 * e, 1e-3 * u, 0.0))
-                for x1, x2, u, e, _ in values.tolist()
-            ]
-        )
-    assert rows[0] == rows[1]
-    assert len(set(itertools.chain(*rows[0]))) > 150
+
+def test_the_base_install_is_enough() -> None:
+    ours = "emb_bench.information.fisher, emb_bench.excitation, emb_bench.sim.open_loop, emb_bench.compiled"
+    code = f"import sys, {ours}; print(*sorted({{'numba', 'scipy', 'matplotlib', 'torch'}} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.strip() == ""
+
+
+def test_states_do_not_depend_on_what_is_asked_about_them() -> None:
+    for plant in (EULER, EXACT, BENCH.plant("rough")):
+        theta, currents = Theta(BRAKE, (1.0, -20.0)), planned(square(20, 4.0))
+        alone, asked = (simulate(plant, theta, currents, T_S, params) for params in ((), ALL))
+        np.testing.assert_array_equal(alone.states, asked.states)
+        assert alone.sensitivities.shape == (500, 0, 2)
+
+
+@pytest.mark.parametrize(
+    ("params", "message"), [(("k_m", "mass"), "'mass' is no parameter"), (("f_v", "f_v"), "comes twice")]
+)
+def test_parameters_that_make_no_sense_are_refused(params: tuple[str, ...], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        simulate(EULER, Theta(BRAKE), planned([1.0]), T_S, params)
+
+
+@pytest.mark.parametrize("delay", [-0.3, 0.0, 0.4])
+@pytest.mark.parametrize("plant", ["exact", "late"])
+def test_experiments_simulated_together_are_each_as_alone(plant: str, delay: float) -> None:
+    late = BENCH.plant(plant)
+    rng = np.random.default_rng(1)
+    windows = [
+        replace(planned(rng.normal(size=n)), before=0.5 * n, late=None if n == 7 else 1e-4 * rng.random(n))
+        for n in (5, 7, 5)
+    ]
+    starts = np.array([[0.1, 3.0], [-0.2, -8.0], [0.0, 0.0]])
+    names = ("k_m", "f_v", "x1_0", "x2_0")
+    theta = Theta(BRAKE, errors=SystematicErrors(0.01, 0.2, delay, 0.03), contact=0.05)
+    together = simulate_apart(late, theta, windows, starts, T_S, names, march)
+    alone = [
+        simulate(late, theta._replace(start=(x1, x2)), window, T_S, names)
+        for window, (x1, x2) in zip(windows, starts.tolist(), strict=True)
+    ]
+    np.testing.assert_array_equal(together.samples, np.concatenate([one.samples for one in alone]))
+    np.testing.assert_array_equal(together.sensitivities, np.concatenate([one.sensitivities for one in alone]))

@@ -16,6 +16,8 @@ from emb_bench.sim.node import BrakeNode
 from emb_bench.sim.simulated_brake import gaussian_noise
 from emb_runtime.can.messages import Layout, StopReason, load_layout
 from emb_runtime.records import Frame, NodeState
+from emb_runtime.safety.state_machine import Fault
+from tests.conftest import Simulate
 from tests.independent import DATABASE, read
 
 QUIET = lambda: (0.0, 0.0, 0.0)  # noqa: E731  a constant
@@ -254,3 +256,36 @@ def test_random_frames_are_never_obeyed_unless_they_are_valid_answers(content: l
         bus.node.receive(Frame(identifier, data))
         bus.tick()
     assert bus.node.obeyed <= legal
+
+
+ENDS: dict[str, Fault | None] = {
+    # What the shield is proved for, and what differs from it in friction at rest only.
+    "euler": None,
+    "exact": None,
+    # Outside its assumptions; the run ends as it should, or the node ends it at a limit.
+    "stribeck": None,
+    "load": None,
+    "cubic": None,
+    "hysteresis": None,
+    "play": None,
+    "lag": Fault.RESPONSE_LATE,
+    "late": Fault.RESPONSE_LATE,
+    "offset": None,
+    "jitter": None,
+    "observer": Fault.RESPONSE_LATE,
+    "rough": Fault.RESPONSE_LATE,
+}
+
+
+def test_every_shipped_plant_has_a_documented_end(bench: Bench) -> None:
+    assert list(ENDS) == list(bench.plants)
+
+
+@pytest.mark.parametrize("plant", list(ENDS))
+def test_full_current_on_any_plant_ends_by_itself_and_as_documented(
+    simulate: Simulate, bench: Bench, plant: str
+) -> None:
+    run = simulate(lambda *_: 6.0, options=f"plant={plant}")
+    assert run.outcome.fault is ENDS[plant]
+    if run.outcome.fault is None:
+        assert run.outcome.counters.answered == bench.timing.horizon

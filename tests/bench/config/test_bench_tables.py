@@ -1,4 +1,4 @@
-"""[plants.*] of a bench file: what is read, and what is refused with file, key and reason."""
+"""[plants.*] and [budgets] of a bench file: what is read, and what is refused with file, key and reason."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import pytest
 
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.config.plants import DIRECTED, EXACT, Instruments, Mechanics, Plant
+from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import BenchFileError
 from tests.benches import SENSOR_TEXT
 
@@ -50,11 +51,6 @@ def test_what_is_said_is_read_and_the_rest_has_its_default() -> None:
 
 def test_the_plants_are_not_part_of_the_contract(bench: Bench) -> None:
     assert parse_bench(TEXT, "my.toml").identity_hash == bench.identity_hash
-
-
-def test_an_unknown_plant_is_refused_with_the_names_of_those_that_there_are(bench: Bench) -> None:
-    with pytest.raises(BenchFileError, match="no plant is called 'rubber'; this bench has: euler, exact, stribeck"):
-        bench.plant("rubber")
 
 
 def test_what_makes_no_plant_is_refused_with_file_key_and_reason() -> None:
@@ -115,3 +111,41 @@ def test_plants_that_are_no_tables_are_refused() -> None:
         parse_bench(f"{TEXT}\n[plants]\nmine = 3\n", "my.toml")
     with pytest.raises(BenchFileError, match="plants: expected a table"):
         parse_bench(f"plants = 3\n{TEXT}", "my.toml")
+
+
+def with_budgets(budgets: str) -> Bench:
+    text = shipped_bench_text()
+    begin, end = text.index("[budgets]"), text.index("# Brakes to simulate")
+    return parse_bench(text[:begin] + budgets + "\n" + text[end:], "b.toml")
+
+
+def test_budgets_are_read_as_they_stand() -> None:
+    budgets = with_budgets('[budgets]\nmissed = 0\nnot_obeyed = 1\n[budgets.age]\n"p99.9" = 2e-4\np100 = 1').budgets
+    assert budgets is not None
+    assert budgets.shares == {"missed": 0.0, "not_obeyed": 1.0}
+    assert budgets.intervals == {"age": {"p99.9": 2e-4, "p100": 1.0}}
+
+
+def test_budgets_are_no_part_of_what_a_policy_depends_on() -> None:
+    assert with_budgets("").identity_hash == parse_bench(shipped_bench_text(), "t").identity_hash
+
+
+def test_the_shipped_response_is_well_within_the_period() -> None:
+    bench = parse_bench(shipped_bench_text(), "t")
+    assert bench.budgets is not None
+    assert max(bench.budgets.intervals["response"].values()) < 0.75 * bench.timing.sample_time
+
+
+def test_a_budget_that_makes_no_sense_is_refused_with_its_name() -> None:
+    for budgets, reason in [
+        ("[budgets]\nmissing = 0.1", "budgets.missing: unknown key; expected some of .*missed"),
+        ("[budgets]\nmissed = 1.5", "budgets.missed: expected a number from 0 to 1, got 1.5"),
+        ("[budgets]\nresponse = 1", "budgets.response: expected a table, got a number, 1"),
+        ("[budgets.slack]\np50 = 1e-3", "budgets.slack: unknown key"),
+        ("[budgets.age]\np42 = 1e-3", "budgets.age.p42: unknown key; expected one of p100, p50, p90, p99, p99.9"),
+        ("[budgets.age]\np99 = 0", "budgets.age.p99: expected a number above 0, at most 1, got 0"),
+        ("[budgets.age]\np99 = 300", "budgets.age.p99: expected a number above 0, at most 1, got 300"),
+        ('[budgets.age]\np99 = "fast"', "budgets.age.p99: expected a number"),
+    ]:
+        with pytest.raises(BenchFileError, match=f"^b.toml: {reason}"):
+            with_budgets(budgets)
