@@ -78,23 +78,25 @@ def test_a_sequence_has_one_current_within_the_limit_for_each_step_of_any_bench(
         assert excitation(name, bench).act(50.0, -300.0, 17.0, Estimator(bench)) == sequence[17], name
 
 
-def test_the_default_square_wave_is_the_thesis_s() -> None:
-    sequence = currents("square")
-    assert sequence[:20].tolist() == [6.0] * 10 + [-6.0] * 10
-    assert np.array_equal(sequence, np.resize(sequence[:20], 500))
+K = np.arange(500)
+SIGNALS: dict[str, Floats] = {
+    "square": np.resize([6.0] * 10 + [-6.0] * 10, 500),  # the thesis's
+    **{
+        f"square:amplitude=2.5,period={period}": 2.5 * scipy.signal.square(2.0 * np.pi * (K + 1e-6) * 1e-3 / period)
+        for period in (0.02, 0.03, 0.007, 0.1)
+    },
+    **{
+        f"chirp:f0={f0},f1={f1}": 3.0 * scipy.signal.chirp(1e-3 * K, f0, 0.5, f1, phi=-90.0)
+        for f0, f1 in ((1.0, 50.0), (80.0, 2.0), (10.0, 10.0))
+    },
+    "ramp:start=-1,amplitude=4": -1.0 + 0.01 * K,
+    "step:amplitude=-2,at=0.1": np.repeat([0.0, -2.0], [100, 400]),
+}
 
 
-@pytest.mark.parametrize("period", [0.02, 0.03, 0.007, 0.1])
-def test_a_square_wave_is_scipy_s(period: float) -> None:
-    k = np.arange(500)
-    expected = 2.5 * scipy.signal.square(2.0 * np.pi * (k + 1e-6) * 1e-3 / period)
-    assert np.array_equal(currents("square", amplitude=2.5, period=period), expected)
-
-
-@pytest.mark.parametrize(("f0", "f1"), [(1.0, 50.0), (80.0, 2.0), (10.0, 10.0)])
-def test_a_chirp_is_scipy_s(f0: float, f1: float) -> None:
-    expected = 3.0 * scipy.signal.chirp(1e-3 * np.arange(500), f0, 0.5, f1, phi=-90.0)
-    assert currents("chirp", f0=f0, f1=f1) == pytest.approx(expected, abs=1e-9)
+@pytest.mark.parametrize("text", SIGNALS)
+def test_a_signal_is_that_of_its_name_beside_scipy_s(text: str) -> None:
+    assert parse_excitation(text, BENCH).currents == pytest.approx(SIGNALS[text], abs=1e-9)
 
 
 def bits_of(order: int, seed: int) -> Floats:
@@ -120,6 +122,7 @@ def test_a_multisine_has_equal_lines_and_nothing_between_them() -> None:
     wanted[2:51:2] = lines[2]
     assert lines == pytest.approx(wanted, abs=1e-9 * lines[2])
     assert lines[2] > 1.0
+    assert np.abs(currents("multisine", amplitude=-4.5)).max() == pytest.approx(4.5, rel=1e-12)  # its peak
 
 
 @pytest.mark.parametrize("count", [5, 12, 25, 60])
@@ -136,28 +139,13 @@ def test_schroeder_s_phases_give_a_low_crest_factor(count: int) -> None:
     assert found < 1.9  # a single sine has 1.41, no phases at all sqrt(2 count)
 
 
-def test_the_peak_of_a_multisine_is_its_amplitude() -> None:
-    assert np.abs(currents("multisine", amplitude=-4.5)).max() == pytest.approx(4.5, rel=1e-12)
-
-
-def test_a_ramp_rises_evenly_and_a_step_steps() -> None:
-    ramp = currents("ramp", start=-1.0, amplitude=4.0)
-    assert ramp[0] == -1.0
-    assert np.diff(ramp) == pytest.approx(0.01)
-    step = currents("step", amplitude=-2.0, at=0.1)
-    assert np.array_equal(step, np.repeat([0.0, -2.0], [100, 400]))
-
-
 def test_constant_speed_holds_the_speed_and_turns_when_told_to() -> None:
     excited = excitation("constant-speed", BENCH, speed=200.0, turn=0.2)
     assert excited.currents is None
     velocity = played(excited, "exact").states[:, 1]
     assert velocity[50:200] == pytest.approx(200.0, abs=1.0)
     assert velocity[260:] == pytest.approx(-200.0, abs=1.0)
-
-
-def test_constant_speed_is_the_speed_limit_by_default() -> None:
-    response = played("constant-speed")
+    response = played("constant-speed")  # at the speed limit by default
     assert response.states[100:, 1] == pytest.approx(500.0, abs=0.5)
     assert not response.kept  # of the angle nobody has spoken
 
