@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import signal
 from collections import deque
 from collections.abc import Iterator
 from itertools import pairwise
-from types import SimpleNamespace
 
-import pytest
-
-from emb_bench.cli.node import main, run_node
+from emb_bench.cli.node import run_node
 from emb_bench.sim.node import BrakeNode
 from emb_bench.sim.transport import SteppedClock
 from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import Frame
-from emb_runtime.system.clock import MonotonicClock
 
 MS = 1_000_000
 
@@ -103,21 +98,3 @@ def test_commands_that_came_meanwhile_are_heard_before_the_tick(bench: Bench, la
 
     run_node(node, bus, clock, MS, None, asked)
     assert (node.samples, node.obeyed) == (2, 1)
-
-
-@pytest.fixture(autouse=True)
-def _handlers() -> Iterator[None]:
-    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    yield
-    for number, handler in kept.items():
-        signal.signal(number, handler)
-
-
-def test_a_node_that_nobody_commands_ends_after_its_duration(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bus = SimpleNamespace(name="can0", send=lambda _: None, receive=lambda _: None, close=lambda: None)
-    clock = MonotonicClock()
-    monkeypatch.setattr("emb_bench.cli.node.open_transport", lambda *_: (bus, clock))
-    assert main(["--iface", "can0", "--duration", "0.2", "--no-rt", "--json"]) == 0
-    assert '"obeyed": 0' in capsys.readouterr().out
