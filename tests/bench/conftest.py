@@ -25,7 +25,6 @@ class Replay:
     """``emb-replay`` in this process; each call checks exit code and streams."""
 
     capsys: pytest.CaptureFixture[str]
-    first: tuple[str, ...] = ()  # Arguments of every call, before its own
 
     def text(self, *arguments: str | Path, code: int = 0) -> str:
         """What it prints; nothing may stand on the error stream."""
@@ -52,7 +51,7 @@ class Replay:
 
     def _run(self, arguments: tuple[str | Path, ...], code: int) -> tuple[str, str]:
         self.capsys.readouterr()  # what fixtures printed
-        assert main([*self.first, *map(str, arguments)]) == code
+        assert main([*map(str, arguments)]) == code
         return self.capsys.readouterr()
 
 

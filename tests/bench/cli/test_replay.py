@@ -10,8 +10,10 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+
 import numpy as np
 import pytest
+
 from emb_bench import api
 from emb_bench.cli.replay import COMMANDS, main
 from emb_bench.config.bench import Bench
@@ -21,14 +23,13 @@ from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import Sensors
 from emb_runtime.numbers import plain
 from emb_runtime.records import CycleRecord
-from tests.bench.flows import fisher
 from tests.bench.conftest import Log, Replay
-from tests.bench.simulated_logs import square, write_log
-from tests.conftest import SimRun, Simulate
-from tests.benches import SENSOR_TEXT
-from tests.bench.conftest import Replay
 from tests.bench.experiment.test_experiment import Lose
-from tests.conftest import Simulate
+from tests.bench.flows import fisher
+from tests.bench.simulated_logs import square, write_log
+from tests.benches import SENSOR_TEXT
+from tests.conftest import SimRun, Simulate
+
 
 @pytest.fixture
 def run(simulate: Simulate) -> SimRun:
