@@ -1,23 +1,26 @@
-"""The parts that a report is made of: markup, numbers, figures."""
+"""The parts that a report is made of: markup, numbers, figures, and sentences on a model that does not fit."""
 
 from __future__ import annotations
 
 import io
 import re
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from emb_bench.config.bench import Bench
 from emb_bench.figures import svg
 from emb_bench.numbers import chance, percent, seconds, share, share_between, signed
 from emb_bench.report.page import environment
+from emb_bench.report.sentences import alarms
 from emb_bench.report.text import Cell, Table, show
 from emb_runtime.numbers import around, between, in_percent, plain
-
-from tests.bench.report_pages import Reader, read  # isort: skip
+from tests.bench.measurements import currents_of, fit, record
+from tests.bench.report_pages import Reader, read
 
 WORDS = st.text(st.characters(exclude_categories=("C", "Z"), include_characters=" "), max_size=60)
 
@@ -134,3 +137,50 @@ def test_a_terminal_shows_verdicts_in_colour_unless_it_is_asked_not_to(
         shown = out.getvalue()
         assert ("\x1b[1;31mWARNING: THE MODEL" in shown, "\x1b[32myes" in shown) == (not no_color, not no_color)
         assert "[b]flat[/b]" in shown
+
+
+@pytest.mark.parametrize(
+    ("plant", "text", "said"),
+    [
+        ("stribeck", "square:period=0.2", "a static friction beyond T_c of about 20 % explains it (24 sigma)"),
+        ("late", "chirp", "a delay of the commands explains 99 % of it (31 sigma)"),
+    ],
+)
+def test_an_effect_explains_a_misfit_only_where_none_is_left(bench: Bench, plant: str, text: str, said: str) -> None:
+    e = fit(bench, "exact", [record(bench, bench.plant(plant), currents_of(bench, text))])
+    assert alarms(e)[0].startswith(said)
+    m = e.validation
+    assert m.cause is not None
+    left = (m.chi2 - m.cause.suspect.fall) / (m.freedom - 1)
+    assert (m.cause.share == 1.0) is (left <= m.expected[1]) is ("% of it" not in said)
+
+
+@pytest.mark.parametrize("text", ["chirp", "square:period=0.2"])
+@pytest.mark.parametrize(("quadratic", "cubic"), [(0.02, -0.0007), (0.01, -0.0004), (-0.02, 0.0007), (-0.012, 0.0003)])
+def test_two_terms_of_a_curve_that_nearly_cancel_are_named_together(
+    bench: Bench, quadratic: float, cubic: float, text: str
+) -> None:
+    """Alone each leaves a misfit, and another effect seems to explain more."""
+    exact = bench.plant("exact")
+    curved = replace(exact, mechanics=exact.mechanics._replace(quadratic=quadratic, cubic=cubic))
+    said = alarms(fit(bench, exact, [record(bench, curved, currents_of(bench, text))]))[0]
+    assert said.startswith("a stiffness with a quadratic and a cubic term explains ")
+    assert "remedy: estimate it as well: --nuisance quadratic,cubic" in said
+
+
+@pytest.mark.parametrize(
+    ("quadratic", "said"),
+    [
+        (0.0005, "a quadratic stiffness of about 0.00048 1/rad explains it (28 sigma)"),
+        (0.0001, "a quadratic stiffness is the most significant (10 sigma)"),
+    ],
+)
+def test_one_term_of_a_curve_is_named_with_its_amount_if_it_explains_residuals_that_are_too_large(
+    bench: Bench, quadratic: float, said: str
+) -> None:
+    """Residuals that are not too large leave no misfit to explain."""
+    exact = bench.plant("exact")
+    curved = replace(exact, mechanics=exact.mechanics._replace(quadratic=quadratic))
+    e = fit(bench, exact, [record(bench, curved, currents_of(bench, "chirp"))])
+    assert alarms(e)[0].startswith(said)
+    assert ("size" in e.validation.alarming) is ("explains" in said)
