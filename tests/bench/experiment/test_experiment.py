@@ -1,3 +1,5 @@
+"""Experiments in logs, of nodes and of mapped drives: what acted, what was measured, and what is lacking."""
+
 from __future__ import annotations
 
 import math
@@ -10,9 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+import simulated_drives
+from emb_bench import api
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Plant
-from emb_bench.experiment.experiment import Experiment, Lack
+from emb_bench.experiment.experiment import Experiment, Floats, Lack
 from emb_bench.experiment.from_log import (
     LOST,
     UNKNOWN,
@@ -23,22 +27,28 @@ from emb_bench.experiment.from_log import (
     samples_before,
 )
 from emb_bench.experiment.simulate import Theta
-from emb_bench.information.evaluation import Fit, information_and_fit
+from emb_bench.information.evaluation import Evaluation, Fit, information_and_fit
 from emb_bench.logs.log import RunLog, read_log
+from emb_bench.numbers import in_samples
+from emb_bench.report import estimate as report
+from emb_bench.report.information import notes
+from emb_bench.report.sentences import assumptions
 from emb_bench.sim.transport import SimTransport, SteppedClock
 from emb_runtime.can.e2e import NO_COUNTER
 from emb_runtime.can.messages import Layout
 from emb_runtime.can.receiver import Reception
-from emb_runtime.config.bench import BrakeParameters, Sensors
+from emb_runtime.cli.main import main
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Sensors, parse_bench
 from emb_runtime.errors import LogError
 from emb_runtime.log.ring_buffer import FrameRecord
 from emb_runtime.records import CycleRecord, Frame, RunState, SensorSample
-
-from tests.bench.hostile import HostileBus, drive, write_trace  # isort: skip
-from tests.bench.simulated_logs import square, write_log  # isort: skip
-from tests.conftest import SimRun, Simulate  # isort: skip
-from tests.independent import DATABASE  # isort: skip
-
+from tests.actors import constant_actor
+from tests.bench.hostile import HostileBus, drive, write_trace
+from tests.bench.simulated_logs import square, write_log
+from tests.benches import measured
+from tests.conftest import SimRun, Simulate
+from tests.drives import EXAMPLES, late_bench
+from tests.independent import DATABASE
 
 VELOCITY = 0x101
 
@@ -301,18 +311,6 @@ def test_gaps_of_one_period_and_of_several() -> None:
     assert x.until(9).gap_unknowns == 3  # a gap that the end cuts to two periods is one of several all the same
 
 
-def test_a_lost_sample_is_no_measurement_and_its_period_stays_known() -> None:
-    x = whole()
-    mask = np.zeros(N, np.bool_)
-    mask[[4, 5]] = True
-    lost = x.lose(mask)
-    assert np.flatnonzero(~lost.measured).tolist() == [4, 5]
-    assert lost.outliers == 2
-    np.testing.assert_array_equal(lost.currents, x.currents)
-    np.testing.assert_array_equal(lost.reported, x.reported)
-    assert len(lost.all_samples) == N + 1
-
-
 def test_a_start_that_may_be_the_origin_is_taken_as_the_origin() -> None:
     x = Experiment("x", np.zeros(2), np.zeros((2, 2)), 0.203, 0.0, 1e-3, False)
     assert x.x0() == (0.203, 0.0)
@@ -373,3 +371,69 @@ def test_the_samples_are_those_that_the_run_took_from_its_frames(
     assert [(s.angle, s.velocity, s.node_state) for s in before] == [
         (s.angle, s.velocity, s.node_state) for s in expected
     ]
+
+
+def run(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[RunLog, list[float]]:
+    """A run whose commands act a sample later than the node assumes; its log, and what acted in each period [A]."""
+    truly: list[float] = []
+
+    broadcast = simulated_drives.DRIVES[name].broadcast
+
+    def watched(drive: simulated_drives.SimulatedDrive) -> list[Frame]:
+        truly.append(drive.applied)
+        return broadcast(drive)
+
+    monkeypatch.setattr(simulated_drives.DRIVES[name], "broadcast", watched)
+    monkeypatch.setattr("signal.signal", lambda *_: None)
+    text = measured(late_bench(polled=name == "mit")).replace("frame_age     = [1, 1]", "frame_age     = [1, 2]")
+    if name == "mit":  # its angle has steps of 3.4 mrad, which its bench file's noise covers
+        text = text.replace("angle    = 1.0e-3", "angle    = 1.7e-3")
+    bench, actor, log = (folder / file for file in ("late.toml", "actor.onnx", "run.mcap"))
+    bench.write_text(text)
+    actor.write_bytes(constant_actor(parse_bench(text, "late.toml"), 2.0))
+    iface = f"map:{EXAMPLES / name}.toml@sim-drive:{name},plant=late-command,angle_noise=1e-3"
+    files = ["--bench", str(bench), "--policy", str(actor), "--log", str(log)]
+    assert main(["--iface", iface, "--serial", "x", *files]) == 0
+    return read_log(log), truly
+
+
+def error(currents: Floats, truly: list[float]) -> float:
+    """Largest, of all periods, from where in the drive's own account they begin best [A]."""
+    n = len(currents)
+    return min(float(np.max(np.abs(currents - truly[begin : begin + n]))) for begin in range(len(truly) - n + 1))
+
+
+@pytest.mark.parametrize(("name", "late"), [("vesc", 1), ("mit", 2)])
+def test_parameters_are_known_from_a_log_of_a_drive_that_tells_its_current_coarsely(
+    name: str, late: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log, truly = run(name, tmp_path, monkeypatch)
+    experiment = read_experiment(log)
+    assert experiment.quality.command_delay == late
+    assert experiment.quality.lacks == {}
+    assert error(np.asarray(log.cycles["applied_current"])[1 : experiment.periods + 1], truly) > 0.04  # as it was told
+    assert error(experiment.currents, truly) < 1e-3
+
+    study = api.estimate(log, model="exact")
+    assert study.model_fits
+    truth = log.truth
+    assert truth is not None
+    for one in study.conclusions:
+        assert one.interval[0] <= getattr(truth, one.label) <= one.interval[1]
+        assert one.interval[1] - one.interval[0] < 0.06 * getattr(truth, one.label)  # 0.04 by an inertia known to 1 %
+    assert [c.label for c in study.conclusions] == list(PARAMETER_NAMES)
+    (note,) = assumptions(study)
+    assert f"the command on the bus, {in_samples(late)} late" in note
+    assert f"NOTE: {note}" in " ".join(report.study_text(study).split())
+    information = api.fisher_information(log, model="exact")
+    assert isinstance(information, Evaluation)
+    assert note in notes(information)
+
+
+def test_of_a_mapping_that_is_not_readable_what_was_told_acted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log, _ = run("vesc", tmp_path, monkeypatch)
+    damaged = replace(log, attachments={**log.attachments, "drive.toml": b"schema = "})
+    experiment = read_experiment(damaged)
+    assert experiment.currents.tolist() == log.cycles["applied_current"][1 : experiment.periods + 1].tolist()
+    assert experiment.quality.within is not None
+    assert np.isnan(experiment.quality.within)
