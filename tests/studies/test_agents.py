@@ -21,14 +21,12 @@ from studies.thesis.agents import (
     FIGURES,
     correlation,
     drops_at_limits,
-    five,
     number,
     on_grid,
     phases,
     rises_early,
     smoothed,
     square_wave,
-    ways_home,
 )
 from studies.thesis.cli import TRAININGS, main
 from studies.thesis.stacked import train_together
@@ -246,25 +244,6 @@ def test_agents_that_leave_the_limits_at_once_get_a_verdict_like_any_other(
     (way,), (home, *_) = (agents.agent_facts(figure, made) for figure in ("fig-5.7", "fig-5.8"))
     assert (way.agrees, way.found) == (False, "none of 5 got to 300 ms")
     assert (home.agrees, home.found[:6]) == (False, "0 of 5")
-
-
-@pytest.mark.slow
-def test_a_planned_way_home_is_the_polynomial_of_six_conditions(made: Trainings) -> None:
-    training = made.first("thesis-trajectory-b")
-    (planned, taken), runs = ways_home(training), five(training)
-    assert planned.shape == taken.shape == (201, 5, 2)
-    np.testing.assert_array_equal(taken, runs.x[300:])
-
-    def derivative(order: int, t: float) -> Any:
-        return np.array([math.perm(power, order) * t ** max(0, power - order) for power in range(6)])
-
-    conditions = [derivative(order, t) for t in (0.0, 0.2) for order in range(3)]
-    for i in range(5):
-        acceleration = (runs.x[300, i, 1] - runs.x[299, i, 1]) / 1e-3
-        ways = np.linalg.solve(conditions, [*runs.x[300, i], acceleration, 0.0, 0.0, 0.0])
-        for k in (0, 50, 137, 200):
-            np.testing.assert_allclose(planned[k, i, 0], derivative(0, 1e-3 * k) @ ways, atol=1e-6)
-            np.testing.assert_allclose(planned[k, i, 1], derivative(1, 1e-3 * k) @ ways, atol=1e-4)
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emb_bench.config.bench import load_bench
-from emb_bench.information.symmetric import pack, unpack
+from emb_bench.information.symmetric import pack
 from emb_runtime.errors import UsageError
 from emb_train.closed_loop import Batch
 from emb_train.rewards import (
@@ -209,14 +209,3 @@ def test_a_reward_gets_the_state_in_which_the_way_home_began(monkeypatch: pytest
         np.testing.assert_array_equal(turn.x, states[20])
         np.testing.assert_array_equal(turn.m, informations[20])
         assert turn.acceleration == pytest.approx((states[20] - states[19])[:, 1] / 1e-3)
-
-
-def test_the_packed_matrix_of_the_environment_is_the_one_that_the_rewards_unpack() -> None:
-    bench = load_bench()
-    batch = Batch(bench, bench.range_set("pm50"), ("k_1", "f_v"), 1)
-    batch.begin(0, np.random.default_rng(0))
-    total = 0.0
-    for _ in range(100):
-        batch.advance(np.full(1, 2.0))
-        total += float(trajectory_return(transition(batch))[0])
-    assert total == pytest.approx(np.linalg.eigvalsh(unpack(batch.experiments.m[0, 100], 2))[0], rel=1e-9)
