@@ -79,7 +79,7 @@ def test_a_sequence_has_one_current_within_the_limit_for_each_step_of_any_bench(
 
 
 K = np.arange(500)
-SIGNALS: dict[str, Floats] = {
+SIGNALS: dict[str, Any] = {
     "square": np.resize([6.0] * 10 + [-6.0] * 10, 500),  # the thesis's
     **{
         f"square:amplitude=2.5,period={period}": 2.5 * scipy.signal.square(2.0 * np.pi * (K + 1e-6) * 1e-3 / period)
