@@ -55,17 +55,10 @@ def node_times_ms(bus: QuietBus, layout: Layout) -> list[float]:
     return [layout.decode_angle(f).device_time_ns / MS for _, f in bus.sent if f.identifier == 0x100]
 
 
-def play(bench: Bench, layout: Layout, late_ns: dict[int, int], periods: int = 20) -> tuple[QuietBus, BrakeNode, int]:
-    clock = LateClock(late_ns)
-    bus = QuietBus(clock)
-    node = BrakeNode(bench, layout, bench.brake, lambda: (0.0, 0.0, 0.0))
-    skipped = run_node(node, bus, clock, MS, periods, lambda: False)
-    return bus, node, skipped
-
-
 def test_a_late_node_skips_and_its_stamps_tell_the_true_time(bench: Bench, layout: Layout) -> None:
-    bus, node, skipped = play(bench, layout, {5: round(3.4 * MS)})
-    assert skipped == 3
+    bus = QuietBus(clock := LateClock({5: round(3.4 * MS)}))
+    node = BrakeNode(bench, layout, bench.brake, lambda: (0.0, 0.0, 0.0))
+    assert run_node(node, bus, clock, MS, 20, lambda: False) == 3
     assert node_times_ms(bus, layout) == [1, 2, 3, 4, *range(8, 21)]
     sent_ns = [t for t, f in bus.sent if f.identifier == 0x100]
     assert min(b - a for a, b in pairwise(sent_ns[5:])) == MS  # no burst, and no drift
@@ -78,16 +71,14 @@ def test_a_babbling_commander_does_not_hold_the_node_up(bench: Bench, layout: La
         def receive(self, deadline_ns: int) -> Frame | None:
             return Frame(0x80, b"")
 
-    clock = LateClock({})
-    bus = Babble(clock)
+    bus = Babble(clock := SteppedClock())
     node = BrakeNode(bench, layout, bench.brake, lambda: (0.0, 0.0, 0.0))
     assert run_node(node, bus, clock, MS, 5, lambda: False) == 0
     assert node.samples == 5
 
 
 def test_commands_that_came_meanwhile_are_heard_before_the_tick(bench: Bench, layout: Layout) -> None:
-    clock = LateClock({})
-    bus = QuietBus(clock)
+    bus = QuietBus(clock := SteppedClock())
     node = BrakeNode(bench, layout, bench.brake, lambda: (0.0, 0.0, 0.0))
     stop: Iterator[bool] = iter([False, False, True])
 
