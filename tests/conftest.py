@@ -213,12 +213,7 @@ def simulating(bench: Bench) -> Simulate:
             frame = transport.receive(deadline_ns)
             return on_receive(frame, transport, clock) if on_receive is not None else frame
 
-        driven: Any = {
-            "send": send,
-            "receive": receive,
-            "now_ns": clock.now_ns,
-            "push": journal.push,
-        } | replaced
+        driven: Any = {"send": send, "receive": receive, "now_ns": clock.now_ns, "push": journal.push} | replaced
         loop = make_loop(on_bench, actor or FunctionActor(law), steps or on_bench.timing.horizon, **driven)
         return SimRun(on_bench, loop.run(), journal, transport, loop.core.guard, sent)
 

@@ -50,8 +50,7 @@ def test_every_command_has_its_help_with_its_exit_codes(site: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("page", "rows"),
-    [("dbc", ("CommandCounter", "BenchIdentity")), ("log-topics", ("policy_current", "monotonic_ns"))],
+    ("page", "rows"), [("dbc", ("CommandCounter", "BenchIdentity")), ("log-topics", ("policy_current", "monotonic_ns"))]
 )
 def test_tables_made_from_the_code_are_in_their_pages(site: Path, page: str, rows: tuple[str, ...]) -> None:
     text = (site / f"reference/{page}.html").read_text(encoding="utf-8")

@@ -46,7 +46,4 @@ def compare(taken: Reception, model: ReceptionModel) -> None:
         demand(state.errors.last == model.counters.get(key), state.name, "stored counter", state.errors.last)
 
 
-TARGETS: dict[str, Callable[[Random], Played]] = {
-    "reception": reception,
-    "guard": play,
-}
+TARGETS: dict[str, Callable[[Random], Played]] = {"reception": reception, "guard": play}

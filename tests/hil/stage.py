@@ -45,10 +45,7 @@ LAYOUT = load_layout()
 COMMAND, VELOCITY = LAYOUT.command.identifier, LAYOUT.velocity.identifier
 PATIENCE = 120.0  # For anything that must come [s]
 BABBLER = 97  # Real-time priority, above the node's: other nodes on a bus ask nobody
-ROLES = {
-    "recorder": "emb_runtime.log.recorder_process",
-    "watchdog": "emb_runtime.safety.watchdog_process",
-}
+ROLES = {"recorder": "emb_runtime.log.recorder_process", "watchdog": "emb_runtime.safety.watchdog_process"}
 
 
 class Child:

@@ -86,12 +86,7 @@ def run(
 ) -> Seen:
     node = LyingNode(bench_identity(bench.identity_hash), lie, seed)
     bus, journal = LyingBus(node, delay_ns), Journal()
-    driven: Any = {
-        "send": bus.send,
-        "receive": bus.receive,
-        "now_ns": bus.clock.now_ns,
-        "push": journal.push,
-    }
+    driven: Any = {"send": bus.send, "receive": bus.receive, "now_ns": bus.clock.now_ns, "push": journal.push}
     outcome = make_loop(bench, actor or FunctionActor(law), steps, **driven, **core).run()
     detected = None if bus.stopped is None or node.began is None else bus.stopped - node.began
     return Seen(outcome, node, journal, detected)

@@ -21,10 +21,7 @@ from emb_runtime.records import Frame
 from tests.independent import DATABASE, with_crc
 from tests.runtime.can.test_messages import fault_of, generic
 
-HEAD = (
-    ' SG_ CRC : 0|8@1+ (1,0) [0|255] "" N',
-    ' SG_ Counter : 8|4@1+ (1,0) [0|14] "" N',
-)
+HEAD = (' SG_ CRC : 0|8@1+ (1,0) [0|255] "" N', ' SG_ Counter : 8|4@1+ (1,0) [0|14] "" N')
 
 
 def text_of(signals: list[str], length: int, data_id: int = 7) -> str:

@@ -16,14 +16,7 @@ from msgspec import to_builtins
 from emb_runtime.can.codec import Fault, FrameRejectedError, Message, from_document
 from emb_runtime.can.e2e import has_valid_crc
 from emb_runtime.can.generated import Codec, Field, generate_codec
-from emb_runtime.can.messages import (
-    AngleFrame,
-    StatusFrame,
-    StopReason,
-    VelocityFrame,
-    bench_identity,
-    load_layout,
-)
+from emb_runtime.can.messages import AngleFrame, StatusFrame, StopReason, VelocityFrame, bench_identity, load_layout
 from emb_runtime.config.bench import CEILING_ANGLE, CEILING_CURRENT, CEILING_VELOCITY, load_bench
 from emb_runtime.errors import FrameError
 from emb_runtime.records import CurrentCommand, Frame, NodeState

@@ -415,11 +415,7 @@ def test_a_real_wait_sees_what_is_readable_and_what_is_not() -> None:
     with ours, theirs:
         fake = FakeSocket()
         fake.descriptor = ours.fileno()
-        bus = SocketCan(
-            "vcan0",
-            MonotonicClock(),
-            open_socket=lambda: cast(socket.socket, fake),
-        )
+        bus = SocketCan("vcan0", MonotonicClock(), open_socket=lambda: cast(socket.socket, fake))
         now_ns = MonotonicClock().now_ns()
         assert bus.receive(now_ns + 1_000_000) is None
         assert MonotonicClock().now_ns() >= now_ns + 1_000_000

@@ -12,13 +12,7 @@ import pytest
 
 from emb_bench.sim.transport import open_sim
 from emb_runtime.can.messages import Layout, StatusFrame, StopReason, load_layout
-from emb_runtime.cli.bus_monitor import (
-    ENOUGH_PAIRS,
-    BusMonitor,
-    BusStatistics,
-    Scatter,
-    listen,
-)
+from emb_runtime.cli.bus_monitor import ENOUGH_PAIRS, BusMonitor, BusStatistics, Scatter, listen
 from emb_runtime.cli.options import parser, prepare
 from emb_runtime.cli.plan import MappedDrive, Stage
 from emb_runtime.cli.preflight import (
@@ -312,12 +306,7 @@ def test_a_node_that_is_ready_is_heard_just_long_enough(listened: Callable[..., 
     assert heard.rates["EMB_Status"] == pytest.approx(10.0)
     assert heard.scatter.angle == pytest.approx(bench.noise.angle, rel=0.2)
     assert heard.scatter.velocity == pytest.approx(bench.noise.velocity, rel=0.2)
-    assert (
-        heard.missing,
-        heard.others,
-        heard.commanded,
-        heard.distrusted,
-    ) == (0, 0, False, False)
+    assert (heard.missing, heard.others, heard.commanded, heard.distrusted) == (0, 0, False, False)
     assert heard.rejections == {}
 
 

@@ -79,18 +79,7 @@ OURS: dict[str, tuple[type, str]] = {
     "guard's drive": (Guard, "check_drive"),
     "guard's clock": (Guard, "check_time"),
 }
-WHILE_STOPPING = (
-    "clock",
-    "receive",
-    "send",
-    "push",
-    "beat",
-    "tripped",
-    "publish",
-    "disarm",
-    "guard",
-    "guard's check",
-)
+WHILE_STOPPING = ("clock", "receive", "send", "push", "beat", "tripped", "publish", "disarm", "guard", "guard's check")
 SILENCING = ("send", "guard", "guard's check", "publish", "tripped")
 """Places through which every frame leaves: where one fails for ever, no frame can."""
 

@@ -129,12 +129,7 @@ def test_a_brake_that_does_not_move_is_given_up(go_home: GoHome) -> None:
 
 @pytest.fixture
 def ended() -> Outcome:
-    return Outcome(
-        **_anything(),
-        fault=None,
-        node_at_rest=True,
-        node_stop_reason=StopReason.DISABLED,
-    )
+    return Outcome(**_anything(), fault=None, node_at_rest=True, node_stop_reason=StopReason.DISABLED)
 
 
 def _anything() -> dict[str, Any]:

@@ -290,10 +290,7 @@ def test_a_status_from_before_the_node_stopped_does_not_say_why(simulate: Simula
 
 @pytest.mark.parametrize(
     ("frame", "fault"),
-    [
-        (Frame(COMMAND, bytes(5)), Fault.FOREIGN_COMMAND),
-        (Frame(0x40, bytes(8), error=True), Fault.BUS_LOST),
-    ],
+    [(Frame(COMMAND, bytes(5)), Fault.FOREIGN_COMMAND), (Frame(0x40, bytes(8), error=True), Fault.BUS_LOST)],
 )
 def test_what_was_overheard_before_a_run_ends_it_before_anything_is_sent(
     simulate: Simulate, frame: Frame, fault: Fault

@@ -40,10 +40,7 @@ PROTECTED = (
         ' SG_ Iq_Measured : 16|32@1- (1,0) [0|0] "A" Host',
     ),
     ("SIG_VALTYPE_ 20 Iq_Setpoint : 1;\n", ""),
-    (
-        'default = "none"',
-        'Axis0_Get_Iq = {kind = "sum", checksum = "Sum", counter = "Count", modulus = 15, start = 3}',
-    ),
+    ('default = "none"', 'Axis0_Get_Iq = {kind = "sum", checksum = "Sum", counter = "Count", modulus = 15, start = 3}'),
 )
 
 

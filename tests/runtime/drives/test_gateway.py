@@ -613,10 +613,7 @@ def test_who_cannot_arm_a_drive_says_which_frames_were_not_believed() -> None:
         receive = it.drive.receive
 
         def changed(
-            wait_ns: int,
-            receive: Callable[[int], Frame | None] = receive,
-            of: int = identifier,
-            data: bytes = data,
+            wait_ns: int, receive: Callable[[int], Frame | None] = receive, of: int = identifier, data: bytes = data
         ) -> Frame | None:
             frame = receive(wait_ns)
             return frame._replace(data=data) if frame is not None and frame.identifier == of else frame

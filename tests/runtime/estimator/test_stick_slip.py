@@ -9,16 +9,7 @@ import pytest
 from scipy import integrate
 from scipy.stats import norm
 
-from emb_runtime.estimator.stick_slip import (
-    KINK,
-    KINK_DECAY,
-    Accelerations,
-    contact,
-    excess,
-    move,
-    normal,
-    slide,
-)
+from emb_runtime.estimator.stick_slip import KINK, KINK_DECAY, Accelerations, contact, excess, move, normal, slide
 
 SURE = 1e-9
 T_S = 1e-3

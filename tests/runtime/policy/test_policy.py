@@ -144,18 +144,13 @@ def on(**changes: Any) -> Bench:
     """The shipped bench with other limits or another sample time."""
     timing = {key: changes.pop(key) for key in ("sample_time", "horizon") if key in changes}
     return dataclasses.replace(
-        BENCH,
-        limits=dataclasses.replace(BENCH.limits, **changes),
-        timing=dataclasses.replace(BENCH.timing, **timing),
+        BENCH, limits=dataclasses.replace(BENCH.limits, **changes), timing=dataclasses.replace(BENCH.timing, **timing)
     )
 
 
 def test_a_bench_that_goes_beyond_the_policys_limits_is_refused_by_its_key_and_a_narrower_one_is_not() -> None:
     small = PolicyLimits(3.0, (-5.0, 50.0), 300.0)
-    for data in (
-        constant_actor(BENCH, 2.0, limits=small),
-        constant_actor(BENCH, 300.0, limits=small, kind="speed"),
-    ):
+    for data in (constant_actor(BENCH, 2.0, limits=small), constant_actor(BENCH, 300.0, limits=small, kind="speed")):
         load_policy(data, on(current=3.0, angle=(-5.0, 50.0), velocity=300.0))
         load_policy(data, on(current=1.0, angle=(-1.0, 20.0), velocity=100.0))
         for key, wider in (

@@ -227,12 +227,7 @@ def test_the_edges_of_a_period_that_counts() -> None:
 
 @pytest.mark.parametrize(
     ("changes", "judged"),
-    [
-        ({}, True),
-        ({"frame_age": (0, 2)}, True),
-        ({"frame_age": (0, 3)}, False),
-        ({"current_lag": 0.0005}, False),
-    ],
+    [({}, True), ({"frame_age": (0, 2)}, True), ({"frame_age": (0, 3)}, False), ({"current_lag": 0.0005}, False)],
 )
 def test_what_the_bench_declares_decides_whether_it_is_judged(changes: dict[str, Any], judged: bool) -> None:
     bench = replace(BENCH, shield=BENCH.shield._replace(**changes))

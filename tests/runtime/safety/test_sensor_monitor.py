@@ -51,9 +51,7 @@ wild = st.floats(-1e6, 1e6) | st.floats(-10.0, 10.0)
 
 
 @given(st.lists(st.tuples(st.floats(1e-9, 1e6), wild, wild, st.booleans(), wild, wild), max_size=8))
-def test_whatever_comes_the_state_stays_finite(
-    samples: list[tuple[float, float, float, bool, float, float]],
-) -> None:
+def test_whatever_comes_the_state_stays_finite(samples: list[tuple[float, float, float, bool, float, float]]) -> None:
     state = begin_monitor(0.0, 0.0)
     for elapsed, angle, velocity, obeyed, command, reported in samples:
         state, verdict = judge(LAW, LIMITS, state, elapsed, angle, velocity, obeyed, command, reported)
