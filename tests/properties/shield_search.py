@@ -167,51 +167,19 @@ POLICIES: dict[str, tuple[Plan, int]] = {
 # --- Noise: (episodes, samples, 2) in shares of what the shield must expect ------------------------------------------
 
 
-def _exact(rng: Generator, m: int, n: int) -> Floats:
-    return np.zeros((m, n, 2))
-
-
-def _gaussian(rng: Generator, m: int, n: int) -> Floats:
-    return np.clip(rng.normal(0.0, 1.0 / 6.0, (m, n, 2)), -1.0, 1.0)
-
-
-def _uniform(rng: Generator, m: int, n: int) -> Floats:
-    return rng.uniform(-1.0, 1.0, (m, n, 2))
-
-
-def _coin_flips(rng: Generator, m: int, n: int) -> Floats:
-    return rng.choice([-1.0, 1.0], (m, n, 2))
-
-
-def _biased(rng: Generator, m: int, n: int) -> Floats:
-    return np.broadcast_to(rng.choice([-1.0, 1.0], (m, 1, 2)), (m, n, 2)).copy()
-
-
-def _ones(rng: Generator, m: int, n: int) -> Floats:
-    return np.ones((m, n, 2))
-
-
 # The number says whether the noise follows the velocity: the brake then looks faster (+1) or slower (−1) than it is.
 NOISES: dict[str, tuple[Plan, int]] = {
-    "none": (_exact, 0),
-    "Gaussian": (_gaussian, 0),
-    "uniform": (_uniform, 0),
-    "coin flips": (_coin_flips, 0),
-    "biased": (_biased, 0),
-    "looks faster": (_ones, 1),
-    "looks slower": (_ones, -1),
+    "none": (lambda _rng, m, n: np.zeros((m, n, 2)), 0),
+    "Gaussian": (lambda rng, m, n: np.clip(rng.normal(0.0, 1.0 / 6.0, (m, n, 2)), -1.0, 1.0), 0),
+    "uniform": (lambda rng, m, n: rng.uniform(-1.0, 1.0, (m, n, 2)), 0),
+    "coin flips": (lambda rng, m, n: rng.choice([-1.0, 1.0], (m, n, 2)), 0),
+    "biased": (lambda rng, m, n: np.repeat(rng.choice([-1.0, 1.0], (m, 1, 2)), n, axis=1), 0),
+    "looks faster": (lambda _rng, m, n: np.ones((m, n, 2)), 1),
+    "looks slower": (lambda _rng, m, n: np.ones((m, n, 2)), -1),
 }
 
 
 # --- Lost commands: (episodes, samples) codes ------------------------------------------------------------------------
-
-
-def _all_obeyed(rng: Generator, m: int, n: int) -> Codes:
-    return np.full((m, n), OBEYED)
-
-
-def _some_lost(rng: Generator, m: int, n: int) -> Codes:
-    return np.where(rng.random((m, n)) < 0.1, LOST, OBEYED)
 
 
 def _bursts(rng: Generator, m: int, n: int) -> Codes:
@@ -225,31 +193,15 @@ def _pairs(rng: Generator, m: int, n: int) -> Codes:
     return np.where(first | np.roll(first, 1, axis=1), LOST, OBEYED)
 
 
-def _when_limited(rng: Generator, m: int, n: int) -> Codes:
-    return np.where(rng.random((m, n)) < 0.5, LOST_IF_LIMITED, OBEYED)
-
-
-def _every_other(rng: Generator, m: int, n: int) -> Codes:
-    return np.broadcast_to(np.where(np.arange(n) % 2 == 1, LOST, OBEYED), (m, n)).copy()
-
-
-def _slow_outward(rng: Generator, m: int, n: int) -> Codes:
-    return np.full((m, n), LOST_IF_SLOW_OUTWARD)
-
-
-def _killed(rng: Generator, m: int, n: int) -> Codes:
-    return np.where(np.arange(n) < rng.integers(0, 500, (m, 1)), OBEYED, LOST)
-
-
 DROPS: dict[str, Callable[[Generator, int, int], Codes]] = {
-    "none": _all_obeyed,
-    "some": _some_lost,
+    "none": lambda _rng, m, n: np.full((m, n), OBEYED),
+    "some": lambda rng, m, n: np.where(rng.random((m, n)) < 0.1, LOST, OBEYED),
     "pairs": _pairs,
     "bursts": _bursts,
-    "when limited": _when_limited,
-    "every other": _every_other,
-    "slow outward": _slow_outward,
-    "killed": _killed,
+    "when limited": lambda rng, m, n: np.where(rng.random((m, n)) < 0.5, LOST_IF_LIMITED, OBEYED),
+    "every other": lambda _rng, m, n: np.tile(np.where(np.arange(n) % 2 == 1, LOST, OBEYED), (m, 1)),
+    "slow outward": lambda _rng, m, n: np.full((m, n), LOST_IF_SLOW_OUTWARD),
+    "killed": lambda rng, m, n: np.where(np.arange(n) < rng.integers(0, 500, (m, 1)), OBEYED, LOST),
 }
 
 
