@@ -292,22 +292,8 @@ class Hostile(NamedTuple):
 
 
 JUNK: tuple[Any, ...] = (
-    *(
-        None,
-        True,
-        "",
-        "x\ny",
-        "\u202e",
-        "\x1b]52;c;AAAA\x07",
-        "a" * 100_000,
-        -1,
-        0,
-        0.5,
-        10**400,
-        1e308,
-        -1e308,
-        5e-324,
-    ),
+    *(None, True, "", "x\ny", "\u202e", "\x1b]52;c;AAAA\x07", "a" * 100_000),
+    *(-1, 0, 0.5, 10**400, 1e308, -1e308, 5e-324),
     *([], [[]], {}, {"a": {}}, [0] * 10_000, 2**63, 2**64, "9" * 5000, "NaN"),
 )
 NUMBERS = (0, 1, 2, 3, 127, 128, 255, 256, 65535, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1)
@@ -321,32 +307,12 @@ def bench_file(dice: random.Random) -> Hostile:
         key, equal, value = lines[at].partition("=")
         size = dice.choice((3, 1000, 20_000, 70_000))
         values = ["nan", "inf", "1e308", "-1", "[]", "{}", '""', "[[1]]", "0x" + "f" * size, "1" * size, "[" * size]
-        values += [
-            '"' + "x" * size + '"',
-            '"\\u202e\\u001b"',
-            "1979-05-27",
-            "true",
-            "[1e-30, 1e30]",
-            "0.0001",
-            "5e-324",
-        ]
+        values += ['"' + "x" * size + '"', '"\\u202e\\u001b"', "1979-05-27", "true"]
+        values += ["[1e-30, 1e30]", "0.0001", "5e-324"]
         values += ["{a=" * (size // 3), '"""' + "\\\n" * (size // 2) + '"""', "1_" * size + "1"]
-        changed = [
-            f"{key}{equal} {dice.choice(values)}",
-            "[" + "a." * size + "a]",
-            "a." * size + "a = 1",
-            "",
-            "#" * size,
-        ]
-        changed += [
-            lines[at] + "\n" + lines[at],
-            f"['{'k' * size}']\nx = 1",
-            "[[plants.x]]",
-            value,
-            "\ufeff",
-            "\x00",
-            "\x1b[2J",
-        ]
+        changed = [f"{key}{equal} {dice.choice(values)}", "[" + "a." * size + "a]", "a." * size + "a = 1", ""]
+        changed += ["#" * size, lines[at] + "\n" + lines[at], f"['{'k' * size}']\nx = 1", "[[plants.x]]"]
+        changed += [value, "\ufeff", "\x00", "\x1b[2J"]
         lines[at] = dice.choice((changed[0], dice.choice(changed)))
     text = "\n".join(lines).encode()
     if dice.randrange(6) == 0:
@@ -438,17 +404,8 @@ def bomb(dice: random.Random) -> bytes:
     """What a chunk may unpack to that is small when packed, and much work."""
     size = dice.choice((1 << 12, 1 << 16, 1 << 20, 1 << 23, 1 << 26))
     message = struct.pack("<BQHIQQ", 5, 22, dice.choice((1, 5, 9)), 0, 1, 1)
-    pattern = dice.choice(
-        (
-            b"\0",
-            b"\x05",
-            b"\x05\x05\x05\x05" + b"\0" * 8,
-            b"\x80" + b"\0" * 8,
-            b"\x03" + b"\0" * 8,
-            message,
-            b"\xff" * 9,
-        )
-    )
+    patterns = [b"\0", b"\x05", b"\x05\x05\x05\x05" + b"\0" * 8, b"\x80" + b"\0" * 8, b"\x03" + b"\0" * 8]
+    pattern = dice.choice([*patterns, message, b"\xff" * 9])
     return (pattern * (size // len(pattern) + 1))[: size // len(pattern) * len(pattern)]
 
 
@@ -482,9 +439,8 @@ def log_bytes(dice: random.Random, honest: bytes) -> bytes:
                 parts = [r for r in parts if not (r[0] == Opcode.ATTACHMENT and r[1][16:40] == whole[16:40])]
                 parts.insert(1, (Opcode.ATTACHMENT, whole))
             case 9:
-                filler = dice.choice(
-                    (b"\x70" + b"\0" * 8, b"\x09" + b"\0" * 8, _LURE, b"\x0c" + struct.pack("<Q", 8) + b"\0" * 8)
-                )
+                eight = b"\0" * 8
+                filler = dice.choice((b"\x70" + eight, b"\x09" + eight, _LURE, b"\x0c" + struct.pack("<Q", 8) + eight))
                 where = dice.choice((20, 300_000))
                 return honest[:where] + filler * (dice.choice((1000, 300_000)) // len(filler)) + honest[where:]
     return file_of(parts)
@@ -497,14 +453,9 @@ _LURE = b"\x06" + struct.pack("<QQQQI", 300_000, 0, 0, 300_000, 7) + b"\x04\0\0\
 def _inside(dice: random.Random) -> bytes:
     """What an attachment may hold."""
     dbc = (Path(__file__).parents[1] / "runtime/emb_runtime/can/emb.dbc").read_bytes()
-    return dice.choice(
-        (
-            lambda: corrupt(dice, dbc),
-            lambda: bench_file(dice).content,
-            lambda: policy_bytes(dice),
-            lambda: b"BO_ 1 x: 8 y\n" * 4000,
-        )
-    )()
+    many = b"BO_ 1 x: 8 y\n" * 4000
+    kinds = lambda: corrupt(dice, dbc), lambda: bench_file(dice).content, lambda: policy_bytes(dice), lambda: many
+    return dice.choice(kinds)()
 
 
 def log(dice: random.Random, honest: bytes) -> Hostile:
@@ -515,12 +466,8 @@ def log(dice: random.Random, honest: bytes) -> Hostile:
 def draw(seed: int, honest_log: bytes) -> Hostile:
     """A hostile file of some kind."""
     dice = random.Random(seed)
-    kinds: tuple[Callable[[random.Random], Hostile], ...] = (
-        bench_file,
-        policy,
-        contract,
-        lambda drawn: log(drawn, honest_log),
-    )
+    kinds: tuple[Callable[[random.Random], Hostile], ...]
+    kinds = bench_file, policy, contract, partial(log, honest=honest_log)
     return dice.choices(kinds, (3, 4, 3, 10))[0](dice)
 
 
@@ -642,14 +589,8 @@ def damages(data: bytes, dice: random.Random) -> Iterator[Damage]:
     yield Damage("of another format", [put(b"x"), put(bytes(1000))], (REFUSED,), words="not an MCAP file")
     yield Damage("without a record", [put(MAGIC), put(MAGIC * 2)], (REFUSED,), words=cut)
     yield Damage("without a message", [put(data[: first[1]] + END)], (REFUSED,), words="it holds none")
-    later = [
-        partial(
-            rewritten,
-            change=with_field(topic, "novelty", "int64"),
-            values=lambda _topic, n, row: {**row, "novelty": n + 1},
-        )
-        for topic in topics
-    ]
+    counted_on = partial(rewritten, values=lambda _topic, n, row: {**row, "novelty": n + 1})
+    later = [partial(counted_on, change=with_field(topic, "novelty", "int64")) for topic in topics]
     new = put(spliced(data, record(0x90, b"anything")))
     yield Damage("of a later version: more fields, other records", [*later, new], (COMPLETE,), True)
     yield Damage("two logs one after the other", [put(data * 2)], (IN_PART,), True, "the end of the file is not that")
