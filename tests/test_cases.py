@@ -8,7 +8,6 @@ import shlex
 import signal
 import sys
 import tomllib
-from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -50,13 +49,6 @@ def called(program: str, arguments: list[str]) -> int:
     except SystemExit as ended:  # of argparse
         return int(ended.code or 0)
     return code
-
-
-@pytest.mark.parametrize("program", PROGRAMS)
-def test_every_command_tells_the_version(program: str, capsys: pytest.CaptureFixture[str]) -> None:
-    for words in ([], *({"emb-replay": [["info"]], "emb-train": [["ppo"]]}.get(program, []))):
-        assert called(program, [*words, "--version"]) == 0
-        assert capsys.readouterr().out == f"{program} {metadata.version('emb-excite')}\n"
 
 
 @pytest.mark.parametrize("program", PROGRAMS)

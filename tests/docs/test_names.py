@@ -1,4 +1,4 @@
-"""Modules, names and files that the pages speak of exist."""
+"""Modules, names and files that the pages speak of exist, and each equation of the thesis has its function."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 FILES = [f"/{path.relative_to(ROOT)}" for kind in ("py", "dbc") for path in ROOT.glob(f"[a-z]*/**/*.{kind}")]
+EQUATIONS = ROOT / "docs/studies/equations.md"
+LAST = {3: 15, 4: 48, 5: 16, 6: 6}
+"""Number of the last equation of each chapter of the thesis: 85 in all."""
 PAGES = [path for path in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")) if path.name != "CHANGELOG.md"]
 
 
@@ -42,3 +45,14 @@ def test_the_first_page_lists_every_other_one() -> None:
     docs = ROOT / "docs"
     listed = re.findall(r"\]\(([\w/.-]+\.md)\)", (docs / "index.md").read_text(encoding="utf-8"))
     assert {str(page.relative_to(docs)) for page in docs.rglob("*.md")} - {"index.md", *listed} == set()
+
+
+def test_each_of_the_85_equations_has_one_row_and_the_name_that_it_gives_exists() -> None:
+    text = EQUATIONS.read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\d\.\d+) \| .+ \| (.+) \|$", text, re.MULTILINE)
+    wanted = [f"{chapter}.{number}" for chapter, last in LAST.items() for number in range(1, last + 1)]
+    assert [number for number, _ in rows] == wanted
+    assert len(wanted) == 85
+    for number, where in rows:
+        (name,) = re.findall(r"^`([\w.]+)`$", where)
+        assert exists(name), number

@@ -1,4 +1,4 @@
-"""A promise without a test is found, and a row that holds no more."""
+"""What the tools that keep this tree are for, they find: a promise without a test, a broken rule, a row of figures."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from tools import style
+from tools.figures import replaced
 from tools.promises import TABLES, problems
 
 PAGE = (
@@ -50,3 +52,58 @@ def test_what_does_not_hold_is_found(tree: Path, name: str, old: str, new: str, 
     text = (tree / name).read_text(encoding="utf-8")
     (tree / name).write_text(text.replace(old, new), encoding="utf-8")
     assert said in " ".join(problems(tree))
+
+
+FIGURES = """\
+| claim | limit | value | command | commit |
+|---|---|---|---|---|
+| old | 1 | 2 | `python a.py` | aaa |
+| other | 1 | 2 | `python b.py` | aaa |
+| old, too | 1 | 2 | `python a.py` | aaa |
+Text.
+"""
+
+
+def test_the_rows_of_a_command_are_those_that_it_prints() -> None:
+    page = replaced(FIGURES, "python a.py", ["| new | – | 3 |"], "bbb")
+    assert page == FIGURES.replace(
+        "| old | 1 | 2 | `python a.py` | aaa |", "| new | – | 3 | `python a.py` | bbb |"
+    ).replace("| old, too | 1 | 2 | `python a.py` | aaa |\n", "")
+
+
+PLANTED = '''
+"""Of no use."""
+from functools import cached_property
+
+class A:
+    """A thing."""
+
+    x: int
+    """Whether it is so."""
+
+    @cached_property
+    def twice(self):
+        """How it is done."""
+        try:
+            pass
+        except ValueError as err:
+            pass
+        except KeyError as err:
+            pass
+'''
+
+
+def test_each_rule_finds_what_breaks_it(tmp_path: Path) -> None:
+    (tmp_path / "planted.py").write_text(PLANTED)
+    (tmp_path / "README.md").write_text("[one](planted.py#a) [two](missing.md) [three](https://a.b/c)" + " " * 20_000)
+    found = [line.removeprefix(f"{tmp_path}/").partition(": ")[0] for line in (
+        *style.docstring_problems(tmp_path / "planted.py"),
+        *style.compiled_problems(tmp_path / "planted.py"),
+        *style.link_problems(tmp_path / "README.md"),
+        *style.size_problems(tmp_path),
+    )]  # fmt: skip
+    assert sorted(found) == ["README.md", "README.md", *(f"planted.py:{line}" for line in (11, 12, 13, 9))]
+
+
+def test_this_tree_breaks_no_rule() -> None:
+    assert not list(style.problems(style.ROOT))
