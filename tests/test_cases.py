@@ -16,6 +16,7 @@ from emb_runtime.config.bench import load_bench, shipped_bench_text
 from tests.actors import constant_actor
 from tests.bench.simulated_logs import square, write_log
 from tests.conftest import Simulate
+from tests.drives import EXAMPLES
 from tools.shipped_files import COMMANDS
 
 PROGRAMS = COMMANDS  # The module whose ``main`` each command calls
@@ -32,6 +33,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path
     (here / "weak.onnx").write_bytes(constant_actor(load_bench(), 2.0, sample_time=2e-3))
     (here / "cut.onnx").write_bytes(constant_actor(load_bench())[:200])
     (here / "link.mcap").symlink_to("run.mcap")
+    for name in ("odrive.toml", "odrive.dbc", "mit.toml", "mit.dbc"):
+        (here / name).symlink_to(EXAMPLES / name)
     for name in ("folder", *(f"folder.{ending}" for ending in ("csv", "html", "onnx", "png", "xml"))):
         (here / name).mkdir()
     for name, content in CASES["files"].items():

@@ -643,6 +643,9 @@ def test_the_command_asks_serves_and_ends_with_its_counts(
     (tmp_path / "late.toml").write_text(late_bench())
     arguments = [str(EXAMPLES / "odrive.toml"), "--drive", "can0", "--node", "vcan0", "--serial", "7", "--no-rt"]
     arguments += ["--json", "--bench", str(tmp_path / "late.toml")]
+    absent = ["can0" if word == "vcan0" else "nosuch0" if word == "can0" else word for word in arguments]
+    assert cli.main([*absent, "--yes"]) == 4
+    assert "nosuch0" in capsys.readouterr().err.splitlines()[-1]
     typed = ["n", "y\n", "y\n"]
     monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
     monkeypatch.setattr(terminal, "forget_typed", lambda: None)
@@ -663,22 +666,3 @@ def test_the_command_asks_serves_and_ends_with_its_counts(
         if code != 3:
             assert json.loads(out)["drive_time_out"].startswith("disarmed within 0.0")
             assert ("TOO LATE: an answer acted 1.20 periods" in err) == (code == 1)
-
-
-def test_wrong_arguments_are_one_line_before_anything_is_opened(
-    capsys: pytest.CaptureFixture[str], tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    folder = tmp_path_factory.mktemp("bench")
-    bench, polled = folder / "late.toml", folder / "polled.toml"
-    bench.write_text(late_bench())
-    polled.write_text(late_bench(polled=True))
-    odrive, mit = str(EXAMPLES / "odrive.toml"), str(EXAMPLES / "mit.toml")
-    for arguments, reason, code in (
-        ([odrive, "--drive", "can0", "--node", "can0", "--serial", "7"], "expected another bus", 2),
-        ([mit, "--drive", "can0", "--node", "vcan0", "--listen", "--bench", str(polled)], "only a drive that", 2),
-        ([odrive, "--drive", "can0", "--node", "vcan0"], "expected --serial TEXT", 2),
-        ([odrive, "--drive", "nosuch0", "--node", "vcan0", "--serial", "7", "--yes"], "nosuch0", 4),
-        ([f"{odrive}x", "--drive", "can0", "--node", "vcan0"], "cannot read it", 2),
-    ):
-        assert cli.main(["--bench", str(bench), *arguments]) == code
-        assert reason in capsys.readouterr().err.splitlines()[-1]

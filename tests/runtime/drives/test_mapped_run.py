@@ -18,7 +18,6 @@ from emb_bench.cli.replay import main as emb_replay
 from emb_bench.rerun import rerun_as_recorded
 from emb_runtime.cli.main import main
 from emb_runtime.config.bench import parse_bench
-from emb_runtime.drives.lock_step import open_mapped
 from emb_runtime.drives.mapping import PROPERTIES, require_fit
 from emb_runtime.drives.phases import Off
 from emb_runtime.errors import BusError, UsageError
@@ -212,13 +211,3 @@ def test_a_mapping_that_does_not_fit_the_bench_is_refused_before_anything_is_sen
         bus = MappedBus(drive, text, tmp_path)
         bus.edit("[can]", f"[can]\nbitrate = {bitrate}")
         require_fit(bus.mapping, parse_bench(text, "bench.toml"))
-
-
-def test_options_that_name_no_drive_and_bus_are_refused(odrive: tuple[MappedBus, EmbRun]) -> None:
-    bus, emb_run = odrive
-    emb_run.refused("expected another bus", "--iface", "can0", "--drive", f"{bus.file}@can0")
-    emb_run.refused("expected FILE@BUS", "--drive", f"{bus.file}@can0")  # in lock-step it is known already
-    bench = parse_bench(late_bench(), "bench.toml")
-    for options in ("@can0", f"{bus.file}@", f"{bus.file}@sim", "a@map:b@can0"):
-        with pytest.raises(UsageError):
-            open_mapped(options, bench)
