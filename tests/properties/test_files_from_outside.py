@@ -64,9 +64,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind[:9])
-@pytest.mark.parametrize("command", COMMANDS)
 def test_whatever_the_path_leads_to_one_line_says_so(
-    command: str, kind: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    kind: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def readinto(file: _Regular, buffer: memoryview) -> int:
         if kind == "fails" and str(file.name) == kind:
@@ -76,18 +75,19 @@ def test_whatever_the_path_leads_to_one_line_says_so(
     plain = _Regular.readinto  # of a disk that is broken
     monkeypatch.setattr(_Regular, "readinto", readinto)
     monkeypatch.chdir(folder)
-    program, *arguments = (word.replace("{}", kind) for word in command.split())
-    monkeypatch.setattr("sys.argv", [program, *arguments])
     before = sorted(Path().iterdir())
-    try:
-        code = run_command(PROGRAMS[program], "")
-    except SystemExit as ended:
-        code = int(ended.code or 0)
-    said = capsys.readouterr().err
-    assert code in COMMANDS[command], said
-    assert said.splitlines()[-1].startswith(program), said
-    assert "Traceback" not in said
-    assert sorted(Path().iterdir()) == before
+    for command, codes in COMMANDS.items():
+        program, *arguments = (word.replace("{}", kind) for word in command.split())
+        monkeypatch.setattr("sys.argv", [program, *arguments])
+        try:
+            code = run_command(PROGRAMS[program], "")
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+        said = capsys.readouterr().err
+        assert code in codes, (command, said)
+        assert said.splitlines()[-1].startswith(program), (command, said)
+        assert "Traceback" not in said, command
+        assert sorted(Path().iterdir()) == before, command
 
 
 RUNS = {"eval", "exec", "__import__", "run_path", "run_module", "read_pickle", "recv"}  # Last words of calls

@@ -235,14 +235,6 @@ def test_the_successor_box_contains_what_any_brake_does(
         assert vl <= v_next <= vh
 
 
-def test_the_successor_box_of_a_brake_that_may_stand_still_contains_its_start() -> None:
-    # Euler's sign(0) = 0: a standing brake starts without friction, a slowly moving one with it.
-    law = make_law(SHIPPED)
-    box = SHIPPED.range_set("envelope")
-    _, _, _, vh = successor(law, 10.0, 10.0, 0.0, 0.01, 6.0)
-    assert euler_step(box.high._replace(k_1=box.low.k_1), 10.0, 0.0, 6.0, law.sample_time)[1] <= vh
-
-
 @settings(max_examples=300, deadline=None)
 @given(
     st.sampled_from([{}, ROUGH, COASTING, {"frame_age": (0, 3)}]),
@@ -265,16 +257,6 @@ def test_the_shield_answers_inside_the_window_in_which_no_current_is_always_if_i
     sent, _ = shield(law, angle, velocity, wanted, past, step)
     assert -law.current <= lowest <= sent <= highest <= law.current
     assert not law.coasting or lowest <= 0.0 <= highest
-
-
-def test_what_was_commanded_matters_to_a_lagging_current_and_not_to_a_fresh_one() -> None:
-    pushed = (6.0,) * 5
-    braked = (-6.0,) * 5
-    lagging, fresh = make_law(bench_with(current_lag=0.002)), make_law(SHIPPED)
-    assert window(fresh, 20.0, 470.0, pushed) == window(fresh, 20.0, 470.0, braked)
-    assert window(lagging, 20.0, 440.0, pushed)[1] < window(lagging, 20.0, 440.0, braked)[1]
-    assert window(fresh, 20.0, 100.0, (math.nan,) * 5) == (-6.0, 6.0)
-    assert window(lagging, 20.0, 100.0, (math.nan,) * 5) == (-6.0, -6.0)
 
 
 # --- One source, two speeds -----------------------------------------------------------------------------------------

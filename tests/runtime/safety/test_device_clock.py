@@ -9,8 +9,6 @@ from __future__ import annotations
 from random import Random
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from emb_runtime.safety.device_clock import DeviceClock
 
@@ -104,12 +102,12 @@ def test_any_sequence_of_pairs_is_judged_as_by_the_account(period_ns: int) -> No
             assert clock.problem == expected
 
 
-def learned(period_ns: int = MS, latencies: tuple[int, ...] = (0,) * 10) -> tuple[DeviceClock, int]:
-    """A clock that has learned from pairs with these latencies, and the device time of the last."""
-    clock, device_ns = DeviceClock(period_ns), 100 * MS
-    for latency_ns in latencies:
-        device_ns += period_ns
-        assert clock.learn(device_ns, BASE + device_ns + latency_ns)
+def learned() -> tuple[DeviceClock, int]:
+    """A clock that has learned from pairs without latency, and the device time of the last."""
+    clock, device_ns = DeviceClock(MS), 100 * MS
+    for _ in range(10):
+        device_ns += MS
+        assert clock.learn(device_ns, BASE + device_ns)
     return clock, device_ns
 
 
@@ -125,24 +123,9 @@ def test_what_is_beyond_two_quartzes_adds_up(ppm: int, earliest: int, latest: in
     assert n >= earliest
 
 
-@given(st.lists(st.integers(0, 1_900_000), min_size=200, max_size=200), st.integers(-400, 400))
-def test_latencies_below_the_allowance_never_blame_a_quartz(latencies: list[int], ppm: int) -> None:
-    clock, device_ns = learned(latencies=tuple(latencies[:10]))
-    for n, late_ns in enumerate(latencies[10:], start=1):
-        arrival_ns = BASE + device_ns + n * MS + late_ns
-        assert clock.time_problem(device_ns + n * (MS + ppm), arrival_ns, arrival_ns) == ""
-
-
 def test_samples_a_quarter_of_a_period_apart_are_off_the_grid() -> None:
     clock, device_ns = learned()
     for n in range(1, 20):
         at_ns = device_ns + n * (MS // 4)
         clock.time_problem(at_ns, BASE + at_ns, BASE + at_ns)
     assert clock.problem == "its samples are 0.250 ms apart, the bench's period is 1 ms"
-
-
-def test_samples_on_the_grid_forgive_those_off_it() -> None:
-    clock, device_ns = learned()
-    for n in range(50):
-        device_ns += MS + (300_000 if n % 5 == 0 else 0)
-        assert clock.time_problem(device_ns, BASE + device_ns, BASE + device_ns) == ""

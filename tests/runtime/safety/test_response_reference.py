@@ -141,40 +141,40 @@ def drawn_law(dice: Random) -> ShieldLaw:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_the_model_is_that_of_the_page(seed: int) -> None:
-    dice = Random(seed)
-    law = drawn_law(dice)
-    bandwidth = dice.choice((None, dice.uniform(800.0, 3000.0)))
-    noise = dice.choice((0.1, dice.uniform(0.5, 3.0)))
-    sensors = Sensors("observer", bandwidth) if bandwidth else BENCH.sensors
-    bench = replace(BENCH, sensors=sensors, noise=replace(BENCH.noise, velocity=noise))
-    model, t = response_model(bench, law), law.sample_time
-    sample = law.box.motor_high * law.current * t  # what the strongest motor adds in one
-    frames = (law.age_high - law.age_low) * t
-    lag = law.delay.lag + (2.0 / bandwidth if bandwidth else 0.0)
-    of = numbers(law)
-    bounds = [(of[f"{n}_low"], of[f"{n}_high"]) for n in ("motor", "friction", "spring", "viscous")]
-    assert model == ResponseModel(
-        sample_time=t,
-        current=law.current,
-        age=law.age_low,
-        oldest=law.age_high,
-        lag=pytest.approx(lag, rel=1e-9, abs=0.0),  # type: ignore[arg-type]
-        extra=pytest.approx(frames + lag, rel=1e-12),  # type: ignore[arg-type]
-        transient=pytest.approx(0.35 * frames + 0.2 * lag, rel=1e-9),  # type: ignore[arg-type]
-        doubts=1 + law.age_high + math.ceil(3 * (frames + lag) / t),
-        early=pytest.approx((0.7 if law.age_low else 6.0) * t),  # type: ignore[arg-type]
-        deviation=pytest.approx(max(noise, 0.02 * sample)),  # type: ignore[arg-type]
-        slides=pytest.approx(max(law.velocity_noise, 6.0 * max(noise, 0.02 * sample))),  # type: ignore[arg-type]
-        holds=pytest.approx(law.box.friction_low / law.box.motor_high),  # type: ignore[arg-type]
-        moves=pytest.approx(law.box.friction_high / law.box.motor_low),  # type: ignore[arg-type]
-        change=law.change,
-        box=law.box,
-        prior=pytest.approx([np.mean(pair) for pair in bounds]),  # type: ignore[arg-type]
-        deviations=pytest.approx([(b - a) / 12**0.5 for a, b in bounds]),  # type: ignore[arg-type]
-        widest=pytest.approx(3.0 * sample),  # type: ignore[arg-type]
-    )
+def test_the_model_is_that_of_the_page() -> None:
+    for seed in range(20):
+        dice = Random(seed)
+        law = drawn_law(dice)
+        bandwidth = dice.choice((None, dice.uniform(800.0, 3000.0)))
+        noise = dice.choice((0.1, dice.uniform(0.5, 3.0)))
+        sensors = Sensors("observer", bandwidth) if bandwidth else BENCH.sensors
+        bench = replace(BENCH, sensors=sensors, noise=replace(BENCH.noise, velocity=noise))
+        model, t = response_model(bench, law), law.sample_time
+        sample = law.box.motor_high * law.current * t  # what the strongest motor adds in one
+        frames = (law.age_high - law.age_low) * t
+        lag = law.delay.lag + (2.0 / bandwidth if bandwidth else 0.0)
+        of = numbers(law)
+        bounds = [(of[f"{n}_low"], of[f"{n}_high"]) for n in ("motor", "friction", "spring", "viscous")]
+        assert model == ResponseModel(
+            sample_time=t,
+            current=law.current,
+            age=law.age_low,
+            oldest=law.age_high,
+            lag=pytest.approx(lag, rel=1e-9, abs=0.0),  # type: ignore[arg-type]
+            extra=pytest.approx(frames + lag, rel=1e-12),  # type: ignore[arg-type]
+            transient=pytest.approx(0.35 * frames + 0.2 * lag, rel=1e-9),  # type: ignore[arg-type]
+            doubts=1 + law.age_high + math.ceil(3 * (frames + lag) / t),
+            early=pytest.approx((0.7 if law.age_low else 6.0) * t),  # type: ignore[arg-type]
+            deviation=pytest.approx(max(noise, 0.02 * sample)),  # type: ignore[arg-type]
+            slides=pytest.approx(max(law.velocity_noise, 6.0 * max(noise, 0.02 * sample))),  # type: ignore[arg-type]
+            holds=pytest.approx(law.box.friction_low / law.box.motor_high),  # type: ignore[arg-type]
+            moves=pytest.approx(law.box.friction_high / law.box.motor_low),  # type: ignore[arg-type]
+            change=law.change,
+            box=law.box,
+            prior=pytest.approx([np.mean(pair) for pair in bounds]),  # type: ignore[arg-type]
+            deviations=pytest.approx([(b - a) / 12**0.5 for a, b in bounds]),  # type: ignore[arg-type]
+            widest=pytest.approx(3.0 * sample),  # type: ignore[arg-type]
+        )
 
 
 def drawn_model(dice: Random) -> ResponseModel:
@@ -205,48 +205,49 @@ def samples(dice: Random, model: ResponseModel) -> Iterator[Row]:
         yield Row(dice.random() > 0.2 * eventful, angle, velocity, command)
 
 
-@pytest.mark.parametrize("seed", range(120))
-def test_filter_and_verdicts_are_those_of_the_page(seed: int) -> None:
-    dice = Random(seed)
-    model = drawn_model(dice)
-    angle, velocity = dice.uniform(-2.0, 2.0), dice.uniform(-9.0, 9.0)
-    state, reference = begin_response(model, angle, velocity), Reference(model, angle, velocity)
-    for row in samples(dice, model):
-        expected = reference.take(*row)
-        state, found = take(model, state, *row)
-        scale = np.sqrt(np.diag(reference.p))
-        assert np.abs((np.array(state.mean) - reference.x) / scale).max() < 1e-5
-        errors = (state.covariance - reference.p[UPPER]) / np.outer(scale, scale)[UPPER]
-        assert np.abs(errors).max() < 1e-5
-        sums = state.innovations, state.misfit, state.likelihood
-        assert (state.slides, state.doubts) == (reference.slid, reference.doubts)
-        assert state.largest == pytest.approx(reference.largest)
-        assert sums == pytest.approx((reference.count, reference.misfit, reference.likelihood), rel=1e-6, abs=1e-6)
-        assert found == expected
+def test_filter_and_verdicts_are_those_of_the_page() -> None:
+    for seed in range(120):
+        dice = Random(seed)
+        model = drawn_model(dice)
+        angle, velocity = dice.uniform(-2.0, 2.0), dice.uniform(-9.0, 9.0)
+        state, reference = begin_response(model, angle, velocity), Reference(model, angle, velocity)
+        for row in samples(dice, model):
+            expected = reference.take(*row)
+            state, found = take(model, state, *row)
+            scale = np.sqrt(np.diag(reference.p))
+            assert np.abs((np.array(state.mean) - reference.x) / scale).max() < 1e-5
+            errors = (state.covariance - reference.p[UPPER]) / np.outer(scale, scale)[UPPER]
+            assert np.abs(errors).max() < 1e-5
+            sums = state.innovations, state.misfit, state.likelihood
+            assert (state.slides, state.doubts) == (reference.slid, reference.doubts)
+            assert state.largest == pytest.approx(reference.largest)
+            assert sums == pytest.approx((reference.count, reference.misfit, reference.likelihood), rel=1e-6, abs=1e-6)
+            assert found == expected, seed
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_the_slow_law_is_that_of_the_page(seed: int) -> None:
-    dice = Random(seed)
-    law = with_numbers(
-        drawn_law(dice), bottom=-dice.uniform(2.0, 5.0), creep=dice.uniform(1.0, 9.0), cruise=dice.uniform(0.1, 0.9),
-        outward_speed=dice.uniform(50.0, 600.0), homeward_speed=dice.uniform(50.0, 600.0),
-    )  # fmt: skip
-    limit, bandwidth = dice.uniform(200.0, 900.0), dice.uniform(400.0, 4000.0)
-    bench = replace(BENCH, sensors=Sensors("observer", bandwidth), limits=replace(BENCH.limits, velocity=limit))
-    t = law.sample_time
-    declared = (law.age_high - law.age_low) * t + law.delay.lag + 2.0 / bandwidth
-    unknown = (6.0 - law.age_low) * t - declared
-    fastest = max(limit - unknown * law.box.motor_high * law.current, 0.25 * law.homeward_speed)
-    homeward = min(math.sqrt(0.5) * law.homeward_speed, fastest)
-    slow = unproven_law(bench, law)
-    assert slow.outward_speed == pytest.approx(min(law.outward_speed, fastest))
-    assert slow.homeward_speed == pytest.approx(homeward)
-    assert slow.bottom == 0.5 * law.bottom
-    home = law.home
-    assert slow.home.cruise == pytest.approx(home.cruise * (homeward - home.creep) / (law.homeward_speed - home.creep))
-    same = {name: numbers(law)[name] for name in ("outward_speed", "homeward_speed", "bottom", "cruise")}
-    assert with_numbers(slow, **same) == law
+def test_the_slow_law_is_that_of_the_page() -> None:
+    for seed in range(20):
+        dice = Random(seed)
+        f, law = dice.uniform, drawn_law(dice)
+        law = with_numbers(law, bottom=-f(2.0, 5.0), creep=f(1.0, 9.0), cruise=f(0.1, 0.9))
+        law = with_numbers(law, outward_speed=f(50.0, 600.0), homeward_speed=f(50.0, 600.0))
+        limit, bandwidth = dice.uniform(200.0, 900.0), dice.uniform(400.0, 4000.0)
+        bench = replace(BENCH, sensors=Sensors("observer", bandwidth), limits=replace(BENCH.limits, velocity=limit))
+        t = law.sample_time
+        declared = (law.age_high - law.age_low) * t + law.delay.lag + 2.0 / bandwidth
+        unknown = (6.0 - law.age_low) * t - declared
+        fastest = max(limit - unknown * law.box.motor_high * law.current, 0.25 * law.homeward_speed)
+        homeward = min(math.sqrt(0.5) * law.homeward_speed, fastest)
+        slow = unproven_law(bench, law)
+        assert slow.outward_speed == pytest.approx(min(law.outward_speed, fastest))
+        assert slow.homeward_speed == pytest.approx(homeward)
+        assert slow.bottom == 0.5 * law.bottom
+        home = law.home
+        assert slow.home.cruise == pytest.approx(
+            home.cruise * (homeward - home.creep) / (law.homeward_speed - home.creep)
+        )
+        same = {name: numbers(law)[name] for name in ("outward_speed", "homeward_speed", "bottom", "cruise")}
+        assert with_numbers(slow, **same) == law
 
 
 NEAT = response_model(BENCH, SHIPPED)._replace(
