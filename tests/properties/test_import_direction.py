@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import graphlib
 import importlib.metadata
 import re
@@ -36,9 +37,18 @@ ROOMS = {
 """Sub-packages and single modules of each package, lowest first: each imports from those before it only."""
 
 
-def imported_modules(path: Path) -> Iterator[str]:
+distributions = functools.cache(importlib.metadata.packages_distributions)
+
+
+@functools.cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@functools.cache
+def imported_modules(path: Path) -> tuple[str, ...]:
     """Every module that a file imports, at its top or in a function; ``a.b.name`` for ``from a.b import name``."""
-    return modules_in(ast.parse(path.read_text(encoding="utf-8")))
+    return tuple(modules_in(tree_of(path)))
 
 
 def modules_in(tree: ast.AST) -> Iterator[str]:
@@ -123,28 +133,24 @@ def test_every_third_party_import_is_declared_in_the_extra_where_it_belongs() ->
         "train/emb_train": train,
         "export/emb_export": bench,
     }
-    by_module = importlib.metadata.packages_distributions()
     for room, declared in allowed.items():
         for path in (ROOT / room).rglob("*.py"):
             for module in set(imported(path)) - OURS - set(sys.stdlib_module_names):
                 # A namespace such as google.protobuf belongs to several distributions: one declared is enough.
-                providers = {p.lower().replace("_", "-") for p in by_module[module]}
+                providers = {p.lower().replace("_", "-") for p in distributions()[module]}
                 assert providers & declared, f"{path} imports {module} ({providers})"
 
 
 def test_an_extra_that_a_message_names_has_every_library_whose_lack_it_explains() -> None:
-    by_module = importlib.metadata.packages_distributions()
     guards = 0
     for path in (file for room in (*MAY_IMPORT, "proof", "studies", "tools") for file in (ROOT / room).rglob("*.py")):
-        for guard in (
-            node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.With)
-        ):
+        for guard in (node for node in ast.walk(tree_of(path)) if isinstance(node, ast.With)):
             call = guard.items[0].context_expr
             if isinstance(call, ast.Call) and ast.unparse(call.func) == "needs":
                 guards += 1
                 extra = ast.literal_eval(call.args[1])
                 for module in loaded_by(guard, path):
-                    providers = {p.lower().replace("_", "-") for p in by_module[module]}
+                    providers = {p.lower().replace("_", "-") for p in distributions()[module]}
                     assert providers & everything_in(extra), f"{path}: [{extra}] has no {module} ({providers})"
     assert guards > 15
 
@@ -162,14 +168,19 @@ def loaded_by(guard: ast.With, path: Path) -> set[str]:
             ours.add(module)
             file = next(iter(ROOT.glob(f"*/{package}"))).joinpath(*rest).with_suffix(".py")
             if file.exists():  # else a name in one, whose own module is found without it
-                top = ast.parse(file.read_text(encoding="utf-8")).body
-                inside += [
-                    name for node in top if isinstance(node, ast.Import | ast.ImportFrom) for name in modules_in(node)
-                ]
+                inside += at_top(file)
             inside += [module.rpartition(".")[0]] if rest else []
     return found
 
 
+@functools.cache
+def at_top(file: Path) -> list[str]:
+    """Every module that a file imports at its top."""
+    top = [node for node in tree_of(file).body if isinstance(node, ast.Import | ast.ImportFrom)]
+    return [name for node in top for name in modules_in(node)]
+
+
+@functools.cache
 def everything_in(extra: str) -> set[str]:
     """Distributions that an extra brings."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
