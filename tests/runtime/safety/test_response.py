@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
@@ -125,15 +125,11 @@ def test_the_estimate_is_that_of_least_squares_with_a_prior() -> None:
     )
 
 
-@pytest.mark.parametrize("commands", [FULL, REVERSING])
-@pytest.mark.parametrize("motor", [0.5, 1.0, 1.5])
-@pytest.mark.parametrize("noise", [None, 1, 2])
-def test_a_velocity_that_follows_at_once_is_proven_within_twenty_samples(
-    commands: list[float], motor: float, noise: int | None
-) -> None:
-    verdict, samples = judged(BENCH, moved(commands, motor=motor, noise=noise))
-    assert verdict == PROVEN
-    assert samples <= 20
+def test_a_velocity_that_follows_at_once_is_proven_within_twenty_samples() -> None:
+    for commands, motor, noise in product((FULL, REVERSING), (0.5, 1.0, 1.5), (None, 1, 2)):
+        verdict, samples = judged(BENCH, moved(commands, motor=motor, noise=noise))
+        assert verdict == PROVEN, (motor, noise)
+        assert samples <= 20, (motor, noise)
 
 
 OBSERVER = r"observer_bandwidth = (\d+) at most"
@@ -153,25 +149,20 @@ RESPONSES: dict[str, tuple[dict[str, float], str, float, float]] = {
 """What is undeclared, and the key and the values that cover it."""
 
 
-@pytest.mark.parametrize("commands", [FULL, REVERSING])
-@pytest.mark.parametrize("motor", [0.6, 1.0, 1.5])
 @pytest.mark.parametrize("name", RESPONSES)
-def test_a_later_response_contradicts_and_its_cause_names_the_key_with_a_value_that_covers_it(
-    name: str, motor: float, commands: list[float]
-) -> None:
+def test_a_later_response_contradicts_and_its_cause_names_the_key_with_a_value_that_covers_it(name: str) -> None:
     response, key, least, most = RESPONSES[name]
-    verdict, n = judged(BENCH, moved(commands, motor=motor, noise=3, **response))  # type: ignore[arg-type]
-    assert verdict == CONTRADICTED
-    assert n <= 30
-    rows = moved([*commands[:n], *[0.0] * 32], motor=motor, noise=3, stop=n, **response)  # type: ignore[arg-type]
-    named = cause(BENCH, MODEL, rows[: n + 1], rows[n + 1 :])
-    found = re.search(key, named)
-    assert found is not None, named
-    assert least <= float(found[1]) <= most
+    for commands, motor in product((FULL, REVERSING), (0.6, 1.0, 1.5)):
+        verdict, n = judged(BENCH, moved(commands, motor=motor, noise=3, **response))  # type: ignore[arg-type]
+        assert verdict == CONTRADICTED, motor
+        assert n <= 30, motor
+        rows = moved([*commands[:n], *[0.0] * 32], motor=motor, noise=3, stop=n, **response)  # type: ignore[arg-type]
+        named = cause(BENCH, MODEL, rows[: n + 1], rows[n + 1 :])
+        found = re.search(key, named)
+        assert found is not None, (motor, named)
+        assert least <= float(found[1]) <= most, motor
 
 
-@pytest.mark.parametrize("motor", [0.6, 1.0, 1.5])
-@pytest.mark.parametrize("levels", [[6.0], [6.0] * 14 + [1.5] * 40 + [-2.0] * 6 + [1.5] * 6])
 @pytest.mark.parametrize(
     ("response", "key", "least", "most"),
     [
@@ -185,16 +176,16 @@ def test_a_later_response_contradicts_and_its_cause_names_the_key_with_a_value_t
     ],
 )
 def test_where_an_observer_is_declared_the_newest_samples_and_the_stop_tell_what_else_is_late(
-    response: dict[str, float], key: str, least: float, most: float, levels: list[float], motor: float
+    response: dict[str, float], key: str, least: float, most: float
 ) -> None:
-    bench, n = declaring(1520.0), max(len(levels), 16)
-    commands = [*levels, *levels[-1:] * (n - len(levels)), *[0.0] * 32]
-    rows = moved(commands, motor=motor, noise=3, stop=n, **response)  # type: ignore[arg-type]
-    kept = rows[max(n - 31, 0) : n + 1]
-    named = cause(bench, response_model(bench, make_law(bench)), kept, rows[n + 1 :])
-    found = re.search(key, named)
-    assert found is not None, named
-    assert least <= float(found[1]) <= most
+    bench = declaring(1520.0)
+    for levels, motor in product((FULL[:16], [6.0] * 14 + [1.5] * 40 + [-2.0] * 6 + [1.5] * 6), (0.6, 1.0, 1.5)):
+        n = len(levels)
+        rows = moved([*levels, *[0.0] * 32], motor=motor, noise=3, stop=n, **response)  # type: ignore[arg-type]
+        named = cause(bench, response_model(bench, make_law(bench)), rows[max(n - 31, 0) : n + 1], rows[n + 1 :])
+        found = re.search(key, named)
+        assert found is not None, (motor, named)
+        assert least <= float(found[1]) <= most, motor
 
 
 def test_measurements_that_are_late_are_named_as_late_frames() -> None:
