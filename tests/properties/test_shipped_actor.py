@@ -126,15 +126,3 @@ def test_quick_ends_where_stop_when_says(tmp_path: Path, capsys: pytest.CaptureF
         ends.append(run.document()["goal_s"])
         assert run.log().run["stop_when"] == goal
     assert ends[0] < ends[1]
-
-
-def test_quick_is_refused_where_it_means_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from emb_runtime.cli.main import main
-
-    for arguments in (["--quick", "--policy", "a.onnx"], ["--quick", "--read-only"]):
-        try:
-            code = main([*arguments, "--log", str(tmp_path / "run.mcap")])
-        except SystemExit as end:  # argparse
-            code = int(str(end.code))
-        assert code == 2
-        assert capsys.readouterr().err

@@ -225,7 +225,3 @@ def test_it_ends_early_where_that_is_asked_for(
         describe = capsys.readouterr()
         assert "the experiment ends after" not in describe.out + describe.err, command
         assert "did not come to its end" not in describe.err, command
-
-
-def test_where_nothing_is_estimated_nothing_can_be_stopped_for(steady: EmbRun) -> None:
-    steady.refused("--stop-when", "--stop-when", "k_1=1%", "--read-only")
