@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import io
+import itertools
 import json
 import re
 import shlex
@@ -88,17 +89,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return here
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_help_is_80_columns_wide_and_ends_with_an_example(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    for columns in ("80", "200"):
+def test_a_help_is_80_columns_wide_and_ends_with_an_example(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, columns in itertools.product(NAMES, ("80", "200")):
         monkeypatch.setenv("COLUMNS", columns)
-        assert [line for line in help_of(name).splitlines() if len(line) > 80] == []
-    assert EXAMPLES[name]
+        assert [line for line in help_of(name).splitlines() if len(line) > 80] == [], name
+        assert EXAMPLES[name], name
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_an_example_is_a_command_line(name: str) -> None:
-    for line in EXAMPLES[name]:
+def test_an_example_is_a_command_line() -> None:
+    for line in itertools.chain(*EXAMPLES.values()):
         words = shlex.split(line)
         asked = [words[: words.index("--")], *map(shlex.split, words[-1].split("&"))] if "--" in words else []
         for part in asked or [shlex.split(one) for one in line.partition(" > ")[0].split("&&")]:
@@ -116,11 +115,11 @@ def test_an_example_of_a_simulated_brake_runs(line: str, folder: Path, monkeypat
     assert called(command, arguments) == (2 if arguments[0] == "timing" else 0)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_it_tells_its_version(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    command, *words = name.split()
-    assert called(command, [*words, "--version"]) == 0
-    assert capsys.readouterr().out == f"{command} {VERSION}\n"
+def test_it_tells_its_version(capsys: pytest.CaptureFixture[str]) -> None:
+    for name in NAMES:
+        command, *words = name.split()
+        assert called(command, [*words, "--version"]) == 0
+        assert capsys.readouterr().out == f"{command} {VERSION}\n"
 
 
 @pytest.mark.parametrize("package", ["emb_runtime", "emb_bench", "emb_train", "emb_export"])
