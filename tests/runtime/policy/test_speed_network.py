@@ -52,11 +52,12 @@ def network(name: str) -> Policy:
 @pytest.mark.parametrize("name", NETWORKS)
 def test_no_brake_of_the_set_leaves_its_limits_and_each_comes_home(name: str, simulate: Simulate) -> None:
     ranges, limits = BENCH.range_set(BENCH.shield.ranges), BENCH.limits
-    shares = np.random.default_rng(7).uniform(-0.5, 1.5, (8, 4)).clip(0.0, 1.0)  # half of them at a border
+    shares = np.random.default_rng(7).uniform(-0.5, 1.5, (4, 4)).clip(0.0, 1.0)  # half of them at a border
+    actor = network(name)
     for number, row in enumerate(shares.tolist()):
         box = zip(PARAMETER_NAMES, row, strict=True)
         theta = [f"{p}={getattr(ranges.low, p) * (1 - s) + getattr(ranges.high, p) * s!r}" for p, s in box]
-        found = simulate(actor=network(name), options=",".join((*theta, f"seed={number}")))
+        found = simulate(actor=actor, options=",".join((*theta, f"seed={number}")))
         low, high = found.transport.node.angle_range
         assert found.outcome.fault is None, (theta, found.outcome.detail)
         assert found.outcome.home
@@ -64,9 +65,11 @@ def test_no_brake_of_the_set_leaves_its_limits_and_each_comes_home(name: str, si
         assert found.transport.node.top_speed <= limits.velocity, theta
 
 
+@pytest.mark.parametrize("skipped", [1, pytest.param(0, marks=pytest.mark.slow)], ids=["", "the other networks"])
 @pytest.mark.parametrize("lie", LIES)
-def test_a_node_that_lies_meanwhile_does_not_drive_it_out_of_its_limits(lie: str) -> None:
-    for name in NETWORKS:
+def test_a_node_that_lies_meanwhile_does_not_drive_it_out_of_its_limits(lie: str, skipped: int) -> None:
+    """By half of the networks, every lie by others than the one before; by the other half at night."""
+    for name in [*NETWORKS][(list(LIES).index(lie) + skipped) % 2 :: 2]:
         seen = run(LIES[lie], actor=network(name))
         assert seen.outcome.fault is None or lie != "honest", (name, seen.outcome.detail)
         assert_inside(seen)
