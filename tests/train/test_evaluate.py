@@ -237,7 +237,7 @@ def test_table_and_document_say_the_same(finished: Path, capsys: pytest.CaptureF
     plant = json.loads(capsys.readouterr().out)["plants"]["euler"]
     row = plant["rows"][0]
     assert row["measure"]["value"] == pytest.approx(np.mean(row["values"]))
-    assert (row["left"], len(row["values"]), row["learned"]) == (0, 4, True)
+    assert (row["violated"], len(row["values"]), row["learned"]) == (0, 4, True)
     assert (plant["optima"], row["against_optimum"]) == ([], None)
     assert run(finished, "--criterion", "weighted") == 0
     line = next(x for x in capsys.readouterr().out.splitlines() if x.startswith(str(finished)))

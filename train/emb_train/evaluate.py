@@ -132,7 +132,7 @@ class Row:
     against_optimum: Score | None
     """Mean share of the optimum over the draws that have one, see :meth:`emb_train.play.Measure.shares`."""
     first_ahead_by: Score  # Mean lead of the first policy, paired by draw
-    left: int  # Experiments that violated the limits, and were stopped there
+    violated: int  # Experiments that violated the limits, and were stopped there
     home: int  # Experiments that ended at home
     values: Floats  # The measure of each draw, shape [draws]
 
@@ -200,7 +200,7 @@ def result(
     return PlantResult(best, rows[policies + int(np.argmax(means[policies:]))].name, over, tuple(rows))
 
 
-HEADER = ("excitation", "measure", "against optimum", "first ahead by", "left", "home")
+HEADER = ("excitation", "measure", "against optimum", "first ahead by", "violated", "home")
 UNIT: Mapping[str, str] = {"difference": "nat", "log-ratio": "nat", "ratio": ""}
 
 
@@ -229,9 +229,9 @@ def _scene(a: Settings) -> str:
     return (
         f"{a.measure.label} of {', '.join(a.parameters)}, relative to the true values; {a.draws} brakes drawn from the "
         f"ranges '{a.ranges}' for evaluation alone, seed {a.seed}; the same brakes and noise for all, all behind the "
-        f"same shield. Brackets are 95 % intervals over the draws. 'left': experiments that left the limits and were "
-        "stopped there; 'home': share that ended at the origin; 'ahead': the first policy's measure minus that of the "
-        f"line, paired by draw.{delays if c.varies else ''}"
+        "same shield. Brackets are 95 % intervals over the draws. 'violated': experiments that left the limits and "
+        "were stopped there; 'home': share that ended at the origin; 'ahead': the first policy's measure minus that of "
+        f"the line, paired by draw.{delays if c.varies else ''}"
     )
 
 
@@ -246,7 +246,7 @@ def _cells(measure: Measure, row: Row, first: bool) -> tuple[str, ...]:
         _interval(row.measure, measure),
         against,
         "" if first else _interval(row.first_ahead_by, measure),
-        f"{row.left}/{len(row.values)}",
+        f"{row.violated}/{len(row.values)}",
         f"{100.0 * row.home / len(row.values):.4g} %",
     )
 
@@ -268,7 +268,7 @@ def _verdict(measure: Measure, plant: PlantResult) -> str:
     how = "ahead of" if ahead.low > 0.0 else "behind" if ahead.high < 0.0 else "not significantly different from"
     return (
         f"{first.name} is {how} the best reference on these draws, {best.name}, by {_interval(ahead, measure)}; "
-        f"{first.left} of {count} runs left the limits, and {count - first.home} did not end at the origin"
+        f"{first.violated} of {count} runs left the limits, and {count - first.home} did not end at the origin"
     )
 
 
