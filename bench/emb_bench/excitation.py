@@ -1,21 +1,21 @@
 """Reference excitations: what the learned ones are compared with, behind one interface.
 
 ``excitation("chirp", bench, f1=80.0)`` or ``parse_excitation("chirp:f1=80", bench)`` gives an :class:`Excitation`. Most
-are sequences of currents, one is a feedback law; all answer a measurement with a current, as a policy does, so that the
-runtime's loop takes any of them as its actor. :func:`run_excitation` plays one against a simulated brake, on request
-behind the envelope shield that the runtime uses: then the limits are kept and the brake is home at the end, whatever
-the excitation wants.
+are sequences of currents, one is a feedback law; all return a current for a measurement, as a policy does, so that the
+runtime's loop can use any of them as its actor. :func:`run_excitation` simulates one on a brake, optionally behind the
+envelope shield of the runtime: then the limits are kept and the brake is home at the end, whatever the excitation
+requests.
 
 | name | what it is |
 |---|---|
-| constant-speed | feedback: as fast as allowed, what tells most about f_v (thesis 5.1.1); backwards from ``turn`` on |
+| constant-speed | feedback: as fast as allowed, best for f_v (thesis 5.1.1); backwards from ``turn`` on |
 | square | the thesis's manual ±6 A, 20 ms square wave (6.2.2), which beat its agents on two parameters |
 | chirp | swept sine, linear in time (Pintelon and Schoukens, System Identification, 2nd ed. 2012, chapter 5) |
 | prbs | maximum-length binary sequence (Golomb, Shift Register Sequences, 1967) |
 | multisine | equal harmonics with Schroeder's phases (IEEE Trans. Information Theory 16, 1970, p. 85) |
 | ramp, step | what the thesis tried first (4.4) |
 
-All but prbs, which is scipy's, runs on the base install.
+All except prbs, which needs scipy, run on the base install.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ from emb_runtime.safety.shield_design import make_law
 
 Law = Callable[[float, float, int], float]  # Measured angle [rad], measured velocity [rad/s] and step to a current [A]
 
-ACTOR = "actor"  # Name of the shipped actor where an excitation is named
+ACTOR = "actor"  # Name of the shipped actor in a list of excitations
 COMPARED = (
     *("square", "chirp", "prbs", "multisine", "ramp", "step", "constant-speed"),
     *("square:period=0.36", "constant-speed:turn=0.15"),
 )
-"""Excitations that an actor is compared with. The last two turn once and need no learning: what it has to beat."""
+"""Excitations that an actor is compared with. The last two reverse once: the best ones without learning."""
 
 SPEED_GAIN = 0.5
 """Share of a speed error that constant-speed removes per sample on the nominal brake; up to 2 would be stable."""
@@ -176,11 +176,11 @@ def run_excitation(
     shielded: bool,
     noise: Floats | None = None,
 ) -> Response:
-    """Play an excitation against a simulated brake: measure, answer, on request shield, move; as in the runtime.
+    """Simulate an excitation on a brake as in the runtime: measure, request, shield if ``shielded``, move.
 
-    With the shield comes the first move of :mod:`emb_runtime.safety.sensor_monitor`; it keeps the limits for the brakes
-    in ``bench.shield.ranges``. Without it only the current limit is kept. Bus and instruments are left out: what acts
-    is not rounded to the steps of its signal, and nothing is late or lost. The brake starts at rest at the origin.
+    The shield keeps the limits for the brakes in ``bench.shield.ranges``; it includes the first move of
+    :mod:`emb_runtime.safety.sensor_monitor`. Without it only the current limit is kept. Bus and instruments are not
+    simulated: the current has no quantisation, and no frame is late or lost. The brake starts at rest at the origin.
     The noise is the errors of each sample's angle [rad] and velocity [rad/s], shape (horizon + 1, 2).
     """
     count = bench.timing.horizon
@@ -231,7 +231,7 @@ def run_excitation(
 
 
 def schroeder_phases(count: int) -> Floats:
-    """Phases of equally strong harmonics 1..count that make a low peak, −π j (j − 1) / count [rad]."""
+    """Phases of equal harmonics 1..count that give a low crest factor, −π j (j − 1) / count [rad]."""
     j = np.arange(1.0, count + 1.0)
     return -math.pi * j * (j - 1.0) / count
 
@@ -261,7 +261,7 @@ def _times(bench: Bench) -> Floats:
 
 
 def _elapsed(bench: Bench, seconds: float) -> NDArray[np.int64]:
-    """Number of whole times ``seconds`` that have passed when each period begins; rounding at a border is mended."""
+    """Number of complete intervals of ``seconds`` [s] before each period, in spite of rounding at a border."""
     return np.floor(_times(bench) / seconds + 1e-9).astype(np.int64)
 
 
@@ -271,7 +271,7 @@ def _periods(bench: Bench, seconds: float) -> int:
 
 
 def _constant_speed(bench: Bench, speed: float, turn: float) -> Law:
-    """Feed forward what the nominal brake needs at this speed and angle, and remove the rest of the error."""
+    """Feed-forward of the nominal brake at this speed and angle, and proportional feedback of the speed error."""
     p, limit = bench.brake, bench.limits.current
     gain = SPEED_GAIN * p.J / bench.timing.sample_time
     back = _periods(bench, turn)
@@ -296,7 +296,7 @@ def _chirp(bench: Bench, amplitude: float, f0: float, f1: float) -> Floats:
 
 
 def _prbs(bench: Bench, amplitude: float, hold: float, order: float, seed: float) -> Floats:
-    """Each bit of a sequence of maximum length, which repeats; another seed is another point of the same cycle."""
+    """Maximum-length sequence, repeated; the seed is its start within the cycle."""
     from scipy.signal import max_len_seq  # slow to import, and for this one only
 
     if seed > 2**order - 1:

@@ -1,8 +1,8 @@
 """Choice of a model: plants are fitted and ranked, and intervals cover all plausible ones.
 
-Every plant is fitted by output error with the same unknowns, and with the systematic errors that it can have. The
-searches begin at the fit of the simplest plant, those with systematic errors at the fit without. A plant that does not
-explain the experiments is fitted again from the best of the others.
+Every plant is fitted by output error with the same unknowns, and with the systematic errors that it can have. Each
+search begins at the fit of the simplest plant; a search with systematic errors begins at the fit without them. A plant
+that does not explain the experiments is fitted again from the best of the others.
 
 *Likelihood.* −2 log L = Σ e²/σ² + Σ log σ² over all samples. The variance counts, because it is part of the model: a
 jittering clock makes samples of a fast brake uncertain. An observer's velocity has no noise besides that of the angles.
@@ -44,7 +44,7 @@ from emb_runtime.estimator.observer import observer_gains
 
 WRONG = 25  # Limit of simulations for a model that does not explain the experiments
 ExperimentsOf = Callable[[Plant], Sequence[Experiment]]
-"""The experiments for a model, whose encoder offset decides if one starts at the origin."""
+"""The experiments for a plant; its encoder offset determines whether an experiment starts at the origin."""
 
 
 def choose_model(

@@ -40,7 +40,7 @@ def make_study(
 ) -> Study:
     """Reads the experiments of logs, estimates from them together, checks the model and draws the conclusions.
 
-    A report also takes logs without an experiment, and studies each of several runs alone besides.
+    A report also accepts logs without an experiment. Of several runs it has, in addition, a study of each one alone.
 
     Raises:
         UsageError: logs do not go together, one run is given twice, or they are too few for the options.

@@ -36,8 +36,8 @@ FIRST = 50  # Samples whose noise distinguishes a run from any other
 def evaluate_one(source: Source, options: CampaignOptions, bench: Bench | None = None) -> Row:
     """Evaluate one log with a bench; without one, with the bench inside the log.
 
-    An error becomes the row's ``error``; the columns before it stay. The bench is its content:
-    another machine does not have the file.
+    An error becomes the row's ``error``; the columns computed before it are kept. The bench is passed by its content,
+    as another machine does not have the file.
     """
     row = failed(source, "")
     try:
@@ -45,13 +45,13 @@ def evaluate_one(source: Source, options: CampaignOptions, bench: Bench | None =
             row |= found
     except EmbError as err:
         return row | {"error": failed(source, str(err))["error"]}
-    except Exception as err:  # one log must not end the campaign: a fault of the program counts as one of the log
+    except Exception as err:  # one log must not end the campaign, even by an error of the program
         return row | {"error": failed(source, f"{source.path}: {type(err).__name__}: {err}")["error"]}
     return row | {"error": None}
 
 
 def _steps(source: Source, options: CampaignOptions, given: Bench | None) -> Iterator[Row]:
-    """Fields of the row, as far as one gets."""
+    """Fields of the row, in steps up to the first error."""
     if source.trouble:
         raise UsageError(f"{source.path}: {source.trouble}")
     with suppress(OSError), open_regular(source.path) as file:
@@ -65,7 +65,7 @@ def _steps(source: Source, options: CampaignOptions, given: Bench | None) -> Ite
     question = options.question(bench)
     experiment = read_experiment(log, bench, source.path)
     yield _of_the_experiment(log, experiment, bench) | {"model": plant.name}
-    import numba  # noqa: F401  # evaluate uses it once it is loaded, which pays for many logs
+    import numba  # noqa: F401  # evaluate uses numba if it is loaded, which is faster for many logs
 
     (evaluation,) = evaluate(log, experiment, bench, [plant], question, "nominal", bench.brake)
     yield _of_the_information(evaluation)
@@ -124,7 +124,7 @@ def _of_the_experiment(log: RunLog, experiment: Experiment, bench: Bench) -> Row
 
 
 def _beginning(experiment: Experiment) -> str | None:
-    """A fingerprint of the first samples, the same in each copy of a log, also a cut one; None of ideal samples."""
+    """Hash of the first samples, equal in each copy of a log, also in a cut one; None for samples without noise."""
     samples = np.ascontiguousarray(experiment.samples[:FIRST].T)
     seen = samples[:, ~np.isnan(samples).any(axis=0)]
     if not (seen != seen[:, :1]).any():

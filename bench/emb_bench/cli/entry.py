@@ -1,4 +1,4 @@
-"""The first step of this room's commands, see :mod:`emb_runtime.system.entry`."""
+"""Entry points of this package's commands, see :mod:`emb_runtime.system.entry`."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from emb_bench import ONE_THREAD
 from emb_runtime.errors import EXIT_DONE, UsageError
 from emb_runtime.system.entry import run_command
 
-GARBAGE = 100_000  # New objects after which Python looks for garbage
+GARBAGE = 100_000  # New objects after which Python collects garbage
 
 
 def emb_node() -> int:
-    """The simulated brake as a node on a CAN bus; Ctrl-C is how it is ended."""
+    """The simulated brake as a node on a CAN bus; Ctrl-C ends it normally."""
     return run_command("emb_bench.cli.node", "", EXIT_DONE)
 
 
@@ -24,9 +24,9 @@ def emb_replay() -> int:
 
 
 def _for_short_work() -> None:
-    """One thread unless the caller's environment says another number, and little search for garbage.
+    """One thread, unless the environment sets another number, and few garbage collections.
 
-    Threads are slower to start than one log's small matrices are to be solved, and imports leave no garbage.
+    Starting threads takes longer than solving the small matrices of one log, and imports leave no garbage.
     """
     for name, value in ONE_THREAD.items():
         os.environ.setdefault(name, value)
@@ -35,12 +35,12 @@ def _for_short_work() -> None:
 
 def emb_commission() -> int:
     """An unknown brake, from a data sheet to a bench file."""
-    message = "emb-commission: interrupted while a log was examined; the same command goes on from there"
+    message = "emb-commission: interrupted while a log was examined; the same command continues from there"
     return run_command("emb_bench.cli.commission", message, prepare=_for_short_work)
 
 
 def emb_hil() -> int:
-    """A command where vcan0 exists, in a kernel under this one if need be."""
+    """A command where vcan0 exists, if necessary in a User-Mode Linux kernel."""
     if sys.platform != "linux":
         from emb_runtime.system.terminal import complain
 

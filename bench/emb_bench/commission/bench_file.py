@@ -1,6 +1,6 @@
-"""Bench files of a commissioning: the one that its steps run with, and the one that it finds.
+"""Bench files of a commissioning: the working file of its steps, and its result.
 
-A file is made from the data sheet's; each number that is not the sheet's has its origin behind it.
+Both begin as a copy of the data sheet's file. A comment behind each changed number gives its source.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from emb_runtime.safety.shield_design import SLOWEST_OBSERVER, make_law
 SHEET, MEASURED = "sheet", "measured"  # Names of the sets of ranges
 WRITTEN = "# Written by emb-commission from a data sheet's bench file. SI units."
 """Mark of a bench file of a commissioning."""
-HEAD = f"#:schema ./bench.schema.json\n{WRITTEN}\n# A number without an origin behind it is that file's.\n"
-UNEXPLAINED = 9.0  # Mean square of the residuals, in variances of the noise at rest, from which on nothing is explained
+HEAD = f"#:schema ./bench.schema.json\n{WRITTEN}\n# A number without a source behind it is from that file.\n"
+UNEXPLAINED = 9.0  # Mean square of the residuals, in variances of the noise at rest, above which no model is accepted
 WIDENED = 0.1  # Share of its value by which a range exceeds the interval: brakes change as they warm and wear
 WIDENED_MISFIT = 0.25  # Share where the residuals contradict every model
-NOISE_WIDENED = 1.2  # Factor from a standard deviation that was measured to the one that is written
-LAG_WIDENED = 1.25  # Factor from the interval of the current loop's time constant to the bound that is written
-NARROWEST, STEP_DOWN = 10.0, 5.0  # Least upper angle limit that is tried, and by how much each try is lower [rad]
+NOISE_WIDENED = 1.2  # Factor from a measured standard deviation to the written one
+LAG_WIDENED = 1.25  # Factor from the interval of the current loop's time constant to the written bound
+NARROWEST, STEP_DOWN = 10.0, 5.0  # Smallest upper angle limit that is tried, and the step between tries [rad]
 
 
 def working_text(sheet: Bench, velocity: Velocity | None = None) -> str:
-    """Bench file that the steps run with: the data sheet's, its angle as far as its ranges have a shield.
+    """Bench file of the steps: the data sheet's, with the largest angle limit for which its ranges have a shield.
 
     Args:
         sheet: the data sheet's bench file.
-        velocity: as the free stroke has shown it. Before, a sheet that does not say where it comes from counts as that
-            of the slowest observer, if there is a shield for one.
+        velocity: source of the velocity, as found by the free stroke; None before it. If the sheet does not declare the
+            source, the slowest observer is then assumed, if there is a shield for it.
     """
     document = _draft(sheet)
     if velocity is not None:
@@ -49,7 +49,7 @@ def working_text(sheet: Bench, velocity: Velocity | None = None) -> str:
     elif "sensors" not in document:
         slowest = SLOWEST_OBSERVER / sheet.timing.sample_time
         document.add("sensors", tomlkit.table())
-        _put(document, "sensors.velocity", "observer", "until it is measured: the data sheet does not say it")
+        _put(document, "sensors.velocity", "observer", "assumed until it is measured; not in the data sheet")
         _put(document, "sensors.observer_bandwidth", slowest, "the slowest for which there is a shield")
         with suppress(BenchFileError):
             return _text(document)
@@ -58,7 +58,7 @@ def working_text(sheet: Bench, velocity: Velocity | None = None) -> str:
 
 
 def found_text(sheet: Bench, found: Findings, logs: str) -> str:
-    """Bench file that is found from ``logs``, as the comments call them.
+    """Resulting bench file; its comments name ``logs`` as the source.
 
     Raises:
         BenchFileError: an interval is not inside of the data sheet's range, or no shield covers the ranges.
@@ -98,11 +98,11 @@ def found_text(sheet: Bench, found: Findings, logs: str) -> str:
 
 
 def measured_range(sheet: Bench, one: Identification, name: str) -> tuple[float, float, str]:
-    """Range of a parameter that is written, and its reason: the interval, widened and cut to the data sheet's.
+    """Written range of a parameter, and its reason: the interval, widened and limited to the data sheet's range.
 
-    The data sheet's stays if no model fits. The shield takes k_1 as the clamping force over the angle: a curve and a
-    hysteresis that were found widen its range. What play takes from the clamping force or adds to it acts as friction:
-    with play T_c keeps the data sheet's range.
+    The data sheet's range is kept if no model fits. For the shield k_1 is the clamping force divided by the angle, so a
+    curve and a hysteresis of the force widen its range. Play changes the clamping force as a friction does, so with
+    play T_c keeps the data sheet's range.
     """
     lowest, highest = sheet_range(sheet, name)
     if not one.fits and one.ratio > UNEXPLAINED:
@@ -147,13 +147,13 @@ def _draft(sheet: Bench) -> TOMLDocument:
     document = parse_toml(sheet.text, sheet.name, BenchFileError)
     document["ranges"] = {SHEET: {name: list(sheet_range(sheet, name)) for name in PARAMETER_NAMES}}
     document["shield"] = {**document["shield"], "ranges": SHEET}
-    document.pop("estimator", None)  # it begins with the shield's ranges
-    document.get("plants", {}).pop(MEASURED, None)  # of a commissioning before, whose result may be a data sheet
+    document.pop("estimator", None)  # its default is the shield's ranges
+    document.get("plants", {}).pop(MEASURED, None)  # of an earlier commissioning, whose result can be a data sheet
     return tomlkit.parse(tomlkit.dumps(document))
 
 
 def _put(document: TOMLDocument, path: str, value: Any, origin: str) -> None:
-    """Set the value of ``table.key``, with its origin behind it."""
+    """Set the value of ``table.key``, with its source as a comment."""
     *tables, key = path.split(".")
     table: Any = document
     for name in tables:
@@ -162,12 +162,12 @@ def _put(document: TOMLDocument, path: str, value: Any, origin: str) -> None:
 
 
 def _put_velocity(document: TOMLDocument, velocity: Velocity, logs: str) -> None:
-    """Set the velocity's origin, as ``logs`` show it."""
+    """Set the source of the velocity, as measured in ``logs``."""
     document.pop("sensors", None)
     document.add("sensors", tomlkit.table())
-    _put(document, "sensors.velocity", velocity.sensors.velocity, f"by {logs} it is {velocity}")
+    _put(document, "sensors.velocity", velocity.sensors.velocity, f"measured with {logs}: {velocity}")
     if velocity.least:
-        origin = f"{MARGIN:.0%} of the slowest that cannot be excluded, or of one that lags no less"
+        origin = f"{MARGIN:.0%} of the slowest that cannot be excluded, or of an equivalent one"
         _put(document, "sensors.observer_bandwidth", _rounded(velocity.least), origin)
 
 

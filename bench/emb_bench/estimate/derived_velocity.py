@@ -29,7 +29,7 @@ BOUNDS = [(0.02, 10.0), (0.7, 1.0)]  # Of bandwidth times sample time, and of th
 STARTS = 3  # Local searches, from the best points of the grid
 ALIKE = 1.25  # Ratio of mean squares below which two observers fit alike
 TOLD = 1.3  # Largest ratio of the bandwidths that fit, for a determined one
-SETTLED = 20  # Samples after the begin or a gap until the initial state of an observer has decayed
+SETTLED = 20  # Samples after the start or a gap until the initial state of an observer has decayed
 FEWEST = 10  # Fewest periods of an experiment
 LONGEST = 20_000  # Most samples of an experiment
 

@@ -45,7 +45,7 @@ SMALLEST = 1e-12  # Share of a period that counts, per unit of an effect; a sens
 SMALL = 1e-6  # Step of the finite differences of samples [rad, rad/s]
 
 DRIFTS = tuple(f"{name}_drift" for name in PARAMETER_NAMES)
-"""Linear changes of the parameters, as shares of them from the begin of a run to its end."""
+"""Linear changes of the parameters, as shares of them from the start of a run to its end."""
 ANGLE_SCALE, CURRENT_SCALE, TIME_SCALE = SCALES = "angle_scale", "current_scale", "time_scale"
 """Relative errors of the scales of angle and current, and of the clock."""
 LAGGING = "velocity_lag"  # Explains a misfit if an observer is found in the velocity

@@ -188,7 +188,7 @@ def _influence(
     problem: Problem, name: str, prior: float, moved: Floats, information: float, scored: float
 ) -> Influence:
     """An effect with the prior deviation ``prior`` of its size."""
-    # The fit gives the value in the middle of a drift; the interval has to cover the begin and the end.
+    # The fit gives the value in the middle of a drift; the interval has to cover the start and the end.
     ends = np.array([0.5 if f"{u.name}_drift" == name else 0.0 for u in problem.unknowns])
     if name == "J":  # all torques scale with it, fixed ones as well: the residuals do not change
         moved, information, scored = np.array([float(u.name in PARAMETER_NAMES) for u in problem.unknowns]), 0.0, 0.0

@@ -14,7 +14,7 @@ from emb_bench.config.plants import Plant
 from emb_runtime.errors import UsageError
 
 REST_SIGMAS = 4.0
-"""Distance below which a mean counts as zero, in its standard deviations: rest at the origin."""
+"""Standard deviations within which a mean counts as zero: rest at the origin."""
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -22,12 +22,12 @@ Booleans = NDArray[np.bool_]
 
 
 class Lack(Enum):
-    """Missing or uncertain part of an experiment; the comments name its numbers."""
+    """Missing or uncertain part of an experiment; the comments name the numbers in ``Quality.lacks``."""
 
-    ENDS_EARLY = auto()  # Periods, and those that the run had to have
+    ENDS_EARLY = auto()  # Periods, and planned periods
     LOST = auto()  # Samples; the currents before them were not reported
     LOST_WITH_CHARGE = auto()  # Samples, and periods whose current follows from the charge
-    CONTRADICTED = auto()  # Periods with another current in the report than in the command
+    CONTRADICTED = auto()  # Periods whose reported current differs from the command
     NO_COUNTERS = auto()
     NO_VELOCITY = auto()  # Bandwidth of the observer in its place [rad/s]
     NO_CURRENT = auto()
@@ -41,16 +41,16 @@ class Lack(Enum):
 
 @dataclass(frozen=True)
 class Quality:
-    """Facts about an experiment besides its samples, by its log."""
+    """Facts about an experiment besides its samples, from its log."""
 
-    planned: int = 0  # Periods that the run was to have
-    braked: int = 0  # Periods that the node braked, because no command came in time
+    planned: int = 0  # Planned periods of the run
+    braked: int = 0  # Periods in which the node braked, because no command came in time
     command_delay: int = 0  # Samples by which commands acted late, by the node's reports
     lacks: Mapping[Lack, tuple[float, ...]] = field(default_factory=dict)  # With the numbers that belong to each
     faults: tuple[str, ...] = ()  # Contradictions of a recording to its map, in words
     within: float | None = None
-    """Of a mapped drive: largest difference of command and report at which the command counts [A]; NaN if its mapping
-    is not readable, so that reports alone count; None of other nodes."""
+    """For a mapped drive: largest difference of command and report at which the command is used [A]; NaN if its
+    mapping is not readable, so that the report is used; None for other nodes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +68,10 @@ class Experiment:
     """Lateness of each sample after the grid, by the node's stamps [s], shape (n,); None without stamps."""
     assumed: Floats | None = None
     """Assumed current of periods without report, NaN for the others [A], shape (n,); None without such gaps.
-    ``currents`` has it as well, or the value of an estimate."""
+    ``currents`` has the same value, or an estimated one."""
     places: Floats | None = None
-    """True angle [rad] and velocity [rad/s] after each gap of several periods by an estimate, shape (gaps, 2); None
-    before one."""
+    """Estimated angle [rad] and velocity [rad/s] after each gap of several periods, shape (gaps, 2); None before an
+    estimate."""
     before: float = 0.0  # Current that acted before the first period [A]
     outliers: int = 0  # Samples removed as outliers
     first: tuple[float, float] = (np.nan, np.nan)  # Sample 0: angle [rad], velocity [rad/s]; NaN where it was lost
@@ -114,20 +114,20 @@ class Experiment:
 
     @property
     def gap_unknowns(self) -> int:
-        """Number of unknowns that the gaps bring: a current, or an angle and a velocity after them."""
+        """Number of unknowns of the gaps: a current for a single period, an angle and a velocity after a longer gap."""
         return len(self.gaps[0]) + 2 * len(self.gaps[1])
 
     def x0(self, encoder_offset: float = 0.0) -> tuple[float, float]:
-        """True angle [rad] and velocity [rad/s] at sample 0; an angle that may be the origin is taken as the origin."""
+        """True angle [rad] and velocity [rad/s] at sample 0; an angle that may be the origin is set to it."""
         angle = self.angle - encoder_offset
         return (0.0 if abs(angle) <= REST_SIGMAS * self.slack else angle), self.velocity
 
     def seen_by(self, plant: Plant) -> Experiment:
-        """The experiment for a plant, whose encoder offset decides if the start may be rest at the origin."""
+        """The experiment for a plant; its encoder offset determines whether the start may be rest at the origin."""
         return replace(self, from_origin=self.x0(plant.instruments.encoder_offset) == (0.0, 0.0))
 
     def start(self, offset: float) -> tuple[float, float]:
-        """True angle [rad] and velocity [rad/s] at sample 0, of an encoder that shows ``offset`` at the origin."""
+        """True angle [rad] and velocity [rad/s] at sample 0, for an encoder that reads ``offset`` at the origin."""
         return (0.0 if self.from_origin else self.angle - offset), self.velocity
 
     def lose(self, mask: Booleans) -> Experiment:
@@ -142,7 +142,7 @@ class Experiment:
         return cut if self.places is None else replace(cut, places=self.places[: len(cut.gaps[1])])
 
     def from_state(self, angle: float, velocity: float) -> Experiment:
-        """The experiment with another state at sample 0 [rad, rad/s], without all that belongs to the old one."""
+        """The experiment with another state at sample 0 [rad, rad/s]; data on the old state are removed."""
         return replace(self, angle=angle, velocity=velocity, slack=0.0, from_origin=False, places=None)
 
     def part(self, begin: int, end: int) -> Experiment:

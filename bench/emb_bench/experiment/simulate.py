@@ -2,8 +2,9 @@
 
 Information, fits, score tests, held-out predictions, the check of a design and commissioning all use :func:`simulate`.
 It includes late commands, an unknown place of contact, gaps in the reports, the lateness of samples, and errors of the
-sensors. A filter corrects the state between two samples, so it has another loop (:mod:`emb_bench.estimate.innovations`)
-around the same period and the same :func:`emb_bench.sim.instruments.reading`.
+sensors. A filter corrects the state between two samples, so it has a loop of its own
+(:mod:`emb_bench.estimate.innovations`), with the same function for a period and the same
+:func:`emb_bench.sim.instruments.reading`.
 
 **Gaps.** The current of a single period without report is an unknown. After several such periods in a row the state is
 set to the next sample, and its angle and velocity are unknowns.
@@ -52,8 +53,8 @@ class Theta(NamedTuple):
     def begin(self, before: float, params: Sequence[str]) -> tuple[Floats, Integers, Floats]:
         """State after a current ``before`` [A], indices of the unknowns, sensitivities to them.
 
-        In the form of :func:`emb_bench.brake.motion.advance`. Another place of contact is a shift of the angle, for
-        nothing else depends on the place.
+        In the form of :func:`emb_bench.brake.motion.advance`. A shift of the contact shifts the angle and changes
+        nothing else.
         """
         x = rest()
         x[0], x[1], x[3] = self.start[0] - self.contact, self.start[1], before + self.errors.current_offset
@@ -100,14 +101,14 @@ def simulate_parts(
 ) -> Iterator[Trajectory]:
     """As :func:`simulate`, an experiment in parts one after the other, so that it takes little memory.
 
-    Of several parts none has a gap.
+    If there are several parts, none may have a gap.
     """
     check_unknowns(params)
     errors, delay = theta.errors, plant.instruments.measurement_delay
     # A negative delay is linearised, which needs its sensitivity.
     early = ("delay",) if errors.delay < 0.0 and "delay" not in params else ()
     x, indices, s = theta.begin(parts[0].before, (*params, *early))
-    if delay:  # states of the next samples: until the delay has passed, the start
+    if delay:  # states of the delayed samples; the start, until the delay has passed
         waiting = (
             np.repeat(x[None], delay, axis=0),
             np.pad(np.repeat(s[None], delay, axis=0), ((0, 0), (0, parts[0].gap_unknowns), (0, 0))),
@@ -193,7 +194,7 @@ def gap_ends(experiment: Experiment, instruments: Instruments) -> tuple[Integers
     """Periods at whose ends the state is set after longer gaps, and that state: angle [rad], velocity [rad/s].
 
     They are those of the first sample after the gap, not one period earlier: integration back through a standstill
-    cannot recover the velocity. The place is that of an estimate, or else the measured one.
+    cannot recover the velocity. The state is the estimated one, or else the measured one.
     """
     delay, last = instruments.measurement_delay, experiment.periods - 1
     breaks = np.minimum(experiment.gaps[1] + int(delay == 0), last)
@@ -215,8 +216,7 @@ def _shown(
 ) -> Trajectory:
     """Samples along the states ``x`` of n + 1 instants, with their sensitivities ``s``.
 
-    The states are those of commands that act late, if they do. Each sample is taken ``late`` [s] after its period,
-    shape (n,).
+    A delay of the commands is already in the states. Each sample is taken ``late`` [s] after its period, shape (n,).
     """
     delay, scale = theta.errors.delay, 1.0 + theta.errors.velocity_gain
     states, shares = x[:, :2] + [theta.contact, 0.0], s[:, :, :2].copy()

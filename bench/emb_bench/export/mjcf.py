@@ -1,8 +1,8 @@
-"""A brake as a model of MuJoCo (MJCF): one joint that turns, driven by a current [A].
+"""A brake as a model of MuJoCo (MJCF): one hinge joint, driven by a current [A].
 
-J is the joint's armature, f_v its damping, T_c its friction loss, k_m the gear of the motor. The clamping force [N] is
-that of a tendon whose length is the travel of the clamp, γ times the angle, and which is slack below contact. MuJoCo's
-friction loss is a soft constraint that acts from step to step: a reversal is as precise as the step.
+J is the joint's armature, f_v its damping, T_c its friction loss, k_m the gear of the motor. A tendon exerts the
+clamping force [N]: its length is the travel of the clamp, γ times the angle, and it is slack below contact. MuJoCo's
+friction loss is a soft constraint for each step: the time of a reversal is as precise as the step.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Sequences of currents that become a policy: an excitation, a design, a profile of others as CSV."""
+"""Sequences of currents for a policy: an excitation, a design, a CSV file from another program."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from emb_runtime.system.input_file import decode, read_bytes
 MOST_BYTES = 64 << 20  # Of a CSV file
 UNITS = {"current": "A", "time": "s"}
 HEAD = re.compile(r"(\w+?)(?:\s*[\[(]\s*(\S*?)\s*[\])]|_(m?A|m?s))?")
-"""A column: its name, its unit in brackets or behind a line."""
+"""A column: its name, and its unit in brackets or after an underscore."""
 EXPECTED = "expected a first line 'current' or 'time,current', then numbers [A], [s]"
 
 
@@ -45,10 +45,10 @@ def read_sequence(text: str, bench: Bench) -> tuple[Floats, str]:
 
 
 def read_profile(text: str, path: Path, bench: Bench) -> tuple[Floats, str]:
-    """The currents [A], shape [horizon], of a table of currents, or of times and currents; and what was done to them.
+    """Currents [A], shape [horizon], of a table of currents, or of times and currents; and a text on all changes.
 
-    Without times each row lasts one sample period, and 0 A follows the last. With times a row lasts until the next, the
-    last one until the end. A current beyond the bench's limit is clipped.
+    Without times each row lasts one sample period, and 0 A follows the last row. With times a row lasts until the next
+    one, the last row until the end. A current beyond the bench's limit is clipped.
     """
     lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
     if len(lines) < 2:
@@ -70,10 +70,10 @@ def read_profile(text: str, path: Path, bench: Bench) -> tuple[Floats, str]:
 
 
 def limited(currents: Floats, bench: Bench, what: str) -> tuple[Floats, str]:
-    """Currents [A] for each sample of the horizon, within the limit; and the changes in words.
+    """Currents [A] for each sample of the horizon, within the limit; and a text on all changes.
 
     Raises:
-        UsageError: there is none, or more than the horizon has.
+        UsageError: there is no current, or there are more than the horizon has.
     """
     horizon, limit = bench.timing.horizon, bench.limits.current
     if not 1 <= len(currents) <= horizon:

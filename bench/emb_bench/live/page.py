@@ -1,4 +1,4 @@
-"""A page for a browser that shows a run while it goes on: ``page.html``, and the JSON that is sent to it.
+"""Browser page that shows a run in progress: ``page.html``, and the JSON that is sent to it.
 
 The page is one file of plain HTML, CSS and JavaScript without a build or a library: NiceGUI and Panel would bring a web
 framework of more than twenty packages to a bench computer for four curves and a table.
@@ -23,7 +23,7 @@ from emb_runtime.estimator.estimate import UNKNOWN, by_name, rows, shares, total
 from emb_runtime.records import Reason, RunState
 
 SUBPROTOCOL = "emb-excite.page"
-KEPT = 600  # Chunks that a browser which comes later gets; a chunk has 0.1 s
+KEPT = 600  # Most chunks that a browser gets when it connects; a chunk has 0.1 s
 TOPICS = ("/cycle", "/estimate", "/safety")
 RUNNING = (RunState.ACTIVE, RunState.HOMING)
 NUMBERS = (*PARAMETER_NAMES, *(f"{name}_deviation" for name in PARAMETER_NAMES))  # Of a message of ``/estimate``
@@ -36,7 +36,7 @@ def html() -> str:
 
 
 class Page:
-    """One log after the other as the messages that the page takes."""
+    """Messages to the page, from one log after the other."""
 
     def __init__(self, empty: str = "") -> None:
         self.begin("", ())
@@ -44,11 +44,11 @@ class Page:
 
     @property
     def so_far(self) -> list[str]:
-        """Messages of the present log, the beginning first; without a log, the advice."""
+        """Messages of the current log in their order; without a log, the advice."""
         return [self._first, *self._sent]
 
     def begin(self, name: str, logs: Sequence[str]) -> str:
-        """Another log begins, one of some that can be shown."""
+        """Begin another log; ``logs`` has the names of all that can be shown."""
         self._first = json.dumps({"begin": name, "logs": logs})
         self._sent: deque[str] = deque(maxlen=KEPT)
         self._schemas: dict[int, mcap.Schema] = {}
@@ -58,7 +58,7 @@ class Page:
         return self._first
 
     def know(self, bench: bytes) -> str:
-        """Limits of the run's bench file, none if it is refused; its systematic errors count from now on."""
+        """Message with the limits of the run's bench file, none if it is refused; stores its systematic errors."""
         try:
             found = parse_bench(bench.decode(), "bench.toml", analysis=True)
         except (BenchFileError, UnicodeDecodeError):
@@ -68,7 +68,7 @@ class Page:
         return self._keep({"limits": [limits.angle, (-speed, speed), (-current, current)]})
 
     def add(self, chunk: Chunk) -> str:
-        """Samples, estimates and transitions of a chunk; times in seconds since the experiment began.
+        """Message with samples, estimates and transitions of a chunk; times are seconds since the experiment began.
 
         Raises:
             TypeError, KeyError, ValueError, AttributeError, google.protobuf.message.DecodeError: it is damaged.
@@ -90,7 +90,7 @@ class Page:
         return self._keep({**document, "table": [*rows(estimate)], "total": total(shares(estimate), self._errors)})
 
     def end(self, reason: str) -> str:
-        """The log has ended: the run's exit reason."""
+        """Message at the end of the log, with the run's exit reason."""
         return self._keep({"result": reason})
 
     def _messages(self, chunk: Chunk) -> Iterator[tuple[str, int, Any]]:

@@ -1,7 +1,7 @@
 """The records of an MCAP file, which may be cut or damaged, and protobuf messages of one kind as columns.
 
 A file is read from the front; its summary is never needed. Every checksum is checked. A damaged record is skipped and
-named in ``missing``. Behind a record whose length is wrong nothing is read.
+named in ``missing``. Nothing is read after a record with a wrong length.
 
 Files are untrusted: sizes are bounded before anything is read or unpacked. One record and one unpacked chunk are in
 memory at a time, neither larger than ``LARGEST``, and descriptions, metadata and attachments have bounds.
@@ -38,8 +38,8 @@ OUR_SCHEMAS = "emb."  # Begin of the names of our schemas: it marks a log of our
 LARGEST = 8 << 20
 """Largest record, and largest chunk once unpacked [bytes]; the chunks of a log have a quarter of a MiB."""
 MOST_PACKED = 32
-"""Times by which a chunk may be larger once unpacked, besides ``SMALL``; those of a log are larger by 4 times."""
-SMALL = 8 << 10  # Size of a chunk that may be packed as well as it can be [bytes]
+"""Largest ratio of a chunk's unpacked size, less ``SMALL``, to its packed size; in a log of ours it is 4."""
+SMALL = 8 << 10  # Unpacked size up to which the ratio has no bound [bytes]
 MOST_DESCRIBED = 500  # Schemas and channels of a log; one of ours has two times twenty
 LARGEST_DESCRIPTION = 32 << 10  # Largest schema or channel [bytes]
 MOST_CARRIED = 32 << 20  # Size of all attachments and metadata together [bytes]; a policy has 4 MiB at most
@@ -55,7 +55,7 @@ DAMAGE = (
     *(McapError, struct.error, UnicodeDecodeError, EOFError),
     *(zstandard.ZstdError, MemoryError, OverflowError, ValueError),
 )
-"""Exceptions of a parser on bytes that passed, or have, no checksum."""
+"""Exceptions of a parser for damaged bytes."""
 
 _MESSAGE = int(Opcode.MESSAGE)
 _NAMES = {int(opcode): opcode.name.lower().replace("_", " ") for opcode in Opcode}
@@ -95,7 +95,7 @@ class McapFile:
 
     def __init__(self, path: Path, file: BinaryIO, size: int) -> None:
         self._path, self._file, self._size = path, file, size
-        # What the chunks read so far, and the records between them, hold:
+        # Content of the chunks and records read so far:
         self.schemas: dict[int, mcap.Schema] = {}
         self.channels: dict[int, mcap.Channel] = {}
         self.metadata: dict[str, dict[str, str]] = {}
@@ -162,7 +162,7 @@ class McapFile:
         """Store the content of a record; returns it if it is a chunk.
 
         Raises:
-            DAMAGE: it is not what it should be.
+            DAMAGE: the record is damaged.
         """
         chunk = None
         match opcode:
@@ -201,7 +201,7 @@ class McapFile:
         return chunk
 
     def _describe(self, *records: mcap.Schema | mcap.Channel) -> None:
-        """Keep schemas and channels; a second one of the same number comes of damage, or of two logs in one file."""
+        """Store schemas and channels; a different one of the same number means damage, or two logs in one file."""
         for record in records:
             described: dict[int, Any] = self.schemas if isinstance(record, mcap.Schema) else self.channels
             if described.setdefault(record.id, record) != record:
@@ -217,14 +217,14 @@ class McapFile:
             raise LogError(f"{self._path}: expected at most {most} MiB of attachments and metadata: no log of ours")
 
     def _add_to_checksum(self, opcode: int, head: bytes, body: bytes) -> None:
-        """Take a record into the running checksum, which begins anew behind the data."""
+        """Add a record to the running checksum, which restarts after the data."""
         if opcode == Opcode.DATA_END:
             self._crc = 0
         elif self._crc is not None:
             self._crc = zlib.crc32(body, zlib.crc32(head, self._crc))
 
     def _check_end(self, at: int) -> None:
-        """Name it if the file does not end as an MCAP file does."""
+        """Report a file that does not end like an MCAP file."""
         self._file.seek(at)
         tail = self._file.read(min(self._size - at, len(MAGIC) + 1))
         if tail != MAGIC and MAGIC.startswith(tail):
@@ -245,7 +245,7 @@ def unpack_chunk(body: bytes) -> Chunk:
     """The content of a chunk's record.
 
     Raises:
-        DAMAGE: it is not what it should be.
+        DAMAGE: the record is damaged.
     """
     _, _, size, crc = CHUNK.unpack_from(body)
     at = CHUNK.size
@@ -269,7 +269,7 @@ def _decompressed(packed: memoryview, compression: str, size: int) -> bytes:
     if compression == "lz4":
         raise OtherFormError("chunks compressed with lz4 are left out: mcap compress writes them again with zstd")
     _require(compression == "zstd", f"expected zstd, got the compression {compression!r}")
-    # zstd takes the frame's own word for its size before the caller's.
+    # zstd trusts the size in the frame more than the caller's.
     claimed = zstandard.frame_content_size(packed)
     _require(claimed in (-1, size), f"its frame claims to unpack to {claimed} bytes, not to {size}")
     return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
@@ -278,7 +278,7 @@ def _decompressed(packed: memoryview, compression: str, size: int) -> bytes:
 def _split(packed: bytes) -> Chunk:
     """Part a chunk into records."""
     at, others, places, described = 0, 0, list[int](), list[mcap.Schema | mcap.Channel]()
-    head, size, keep = RECORD.unpack_from, RECORD.size, places.append  # a turn a message: an hour has 3e7
+    head, size, keep = RECORD.unpack_from, RECORD.size, places.append  # one pass for each message: an hour has 3e7
     while at + size <= len(packed):
         opcode, length = head(packed, at)
         if opcode == _MESSAGE:
@@ -291,7 +291,7 @@ def _split(packed: bytes) -> Chunk:
         at += size + length
     _require(at == len(packed), "a record in it is not whole")
     _require(not places or places[-1] + HEADER.itemsize <= at, "a message in it is not whole")
-    # A view of the bytes from each place on: as plain bytes the headers are gathered five times as fast.
+    # Raw bytes at each offset: numpy gathers them five times as fast as structured headers.
     begins = np.ndarray((max(0, at - HEADER.itemsize + 1),), f"V{HEADER.itemsize}", packed, strides=(1,))
     headers = begins[np.array(places, np.int64)].view(HEADER)
     _require(bool((headers["length"] >= HEADER.itemsize - RECORD.size).all()), "a message in it is not whole")
@@ -300,7 +300,7 @@ def _split(packed: bytes) -> Chunk:
 
 @lru_cache(maxsize=256)
 def _parse_description(opcode: int, content: bytes) -> mcap.Schema | mcap.Channel:
-    """A schema or a channel, which every log of one version has alike, and twice."""
+    """A schema or a channel; cached, as all logs of one version have the same ones, twice each."""
     _require(
         len(content) <= LARGEST_DESCRIPTION, f"a description in it has {len(content)} bytes, more than any of ours"
     )
@@ -367,7 +367,7 @@ def message_class(name: str, descriptors: bytes) -> Any:
 
 @lru_cache(maxsize=64)
 def describe(factory: Any, units: str = "{}") -> tuple[Column, ...]:
-    """The columns that the fields of a message become, all but messages in it; ``units`` are JSON by field.
+    """Columns of a message's fields, without embedded messages; ``units`` are JSON by field.
 
     Raises:
         ValueError: the units are not JSON.
@@ -383,11 +383,11 @@ def describe(factory: Any, units: str = "{}") -> tuple[Column, ...]:
 
 
 def message_columns(factory: Any, payloads: Sequence[bytes]) -> dict[str, NDArray[Any]]:
-    """The fields of n serialised messages, each of shape (n,), but those that are messages themselves.
+    """The fields of n serialised messages, without embedded messages, each of shape (n,).
 
-    Numbers are int64 or float64, bool is bool, text and bytes are objects. The messages are parsed as one whose fields
-    are repeated. That takes a field in each of them, as in the messages of a log: any other field is parsed message by
-    message, and so are those of a message that was cut, and of the next one, of which it took the first bytes.
+    Numbers are int64 or float64, bool is bool, text and bytes are objects. The messages are parsed as one message with
+    repeated fields. This requires that all n messages have the field, as in a log of ours. If some lack it, or one is
+    cut and takes the first bytes of the next, the field is parsed message by message.
 
     Raises:
         google.protobuf.message.DecodeError: a message is damaged.
@@ -407,7 +407,7 @@ def message_columns(factory: Any, payloads: Sequence[bytes]) -> dict[str, NDArra
 
 @lru_cache(maxsize=64)
 def _repeated(factory: Any) -> Any:
-    """The class of a message with the same fields, but messages, each of them repeated."""
+    """Class of a message with the same fields, each repeated; without embedded messages."""
     file = descriptor_pb2.FileDescriptorProto(name="repeated.proto", syntax="proto3")
     message = file.message_type.add(name="Repeated")
     for entry in factory.DESCRIPTOR.fields:

@@ -212,7 +212,7 @@ def feedback(
 ) -> Iterator[tuple[float, float, float]]:
     """The current of each period [A], angle [rad] and velocity [rad/s] at its end, without end, under a feedback law.
 
-    The law takes the true angle [rad] and velocity [rad/s] at the begin of a period and its number.
+    The law takes the true angle [rad] and velocity [rad/s] at the start of a period and its number.
     """
     x = rest()
     x[:2] = x0

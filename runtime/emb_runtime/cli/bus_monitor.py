@@ -20,20 +20,20 @@ from emb_runtime.system.clock import Clock
 if TYPE_CHECKING:
     from emb_runtime.drives.mapping import Mapping as DriveMapping
 
-ENOUGH_PAIRS = 200  # Sensor pairs that give a standard deviation to within a twentieth
-RECENT_PAIRS = 4000  # Pairs that the scatter is taken from
+ENOUGH_PAIRS = 200  # Sensor pairs for a standard deviation with an error of 5 %
+RECENT_PAIRS = 4000  # Most pairs for the scatter
 OTHERS_BITS = worst_bits(8)  # Bits of a foreign frame, counted as one of 8 bytes with an 11-bit identifier
 
 
 def planned_load(bench: Bench, layout: Layout, drive: DriveMapping | None) -> float:
-    """Worst-case share of the bus that a run takes, 1.0 being all of it: of a mapped drive's bus, if there is one."""
+    """Worst-case load of the bus by a run, 1.0 being full; of a mapped drive's bus, if there is one."""
     return layout.bus_load(bench.can.bitrate) if drive is None else drive.bus_load(bench.timing.sample_time)
 
 
 class Scatter(NamedTuple):
     """Scatter of the sensors at rest."""
 
-    pairs: int  # Number of the newest pairs, all of an idle node, that it is of
+    pairs: int  # Number of pairs, the newest ones of an idle node
     angle: float  # Standard deviation; NaN for fewer than two pairs [rad]
     velocity: float  # [rad/s]
 
@@ -45,11 +45,11 @@ class BusStatistics:
     duration: float  # Time from the first frame to the last [s]
     frames: Mapping[str, int]  # Frames by message name
     rates: Mapping[str, float]  # Mean rate by message name, of those seen at least twice [1/s]
-    others: int  # Data and remote frames that are none of the DBC's
+    others: int  # Data and remote frames that are not in the DBC
     load: float
-    """Share of the bus that all frames took, with every stuff bit that there can be."""
+    """Bus load by all frames, with the largest possible number of stuff bits."""
     rejections: Mapping[str, Mapping[str, int]]  # Rejections as in :class:`~emb_runtime.control.result.Outcome`
-    distrusted: bool  # True after so many of them that a run would have been stopped
+    distrusted: bool  # True after so many rejections that a run would have been stopped
     bus_errors: Mapping[str, int]  # Bus errors as in :class:`~emb_runtime.control.result.Outcome`
     dropped: int  # Frames that the kernel dropped
     commanded: bool  # Another sender commands the node
@@ -90,7 +90,7 @@ class BusMonitor:
         self._layout = layout
         self._names = {message.identifier: message.name for message in layout.all_messages}
         self._reception = Reception(layout, bench, on_rejected)
-        self._seen: dict[str | None, Seen] = {}  # By message name; None for those that are none of the DBC's
+        self._seen: dict[str | None, Seen] = {}  # By message name; None for frames that are not in the DBC
         self._periods_ns: deque[int] = deque(maxlen=RECENT_PAIRS)
         self._at_rest: deque[tuple[float, float]] = deque(maxlen=RECENT_PAIRS)
         self._missing = 0
@@ -103,7 +103,7 @@ class BusMonitor:
         return self._reception.status
 
     def add_frame(self, frame: Frame) -> SensorSample | None:
-        """Add one frame; gives a sample when it completes a valid pair."""
+        """Add one frame; returns a sample if it completes a valid pair."""
         if not frame.error:
             name = None if frame.extended else self._names.get(frame.identifier)
             frames, first_ns, last_ns = self._seen.get(name, (0, frame.time_ns, frame.time_ns))
@@ -114,7 +114,7 @@ class BusMonitor:
         return sample
 
     def add_old_frame(self, frame: Frame) -> None:
-        """Add a frame from before: it counts only if it is alarming."""
+        """Add a frame from before the monitor began: it counts only if it is alarming."""
         if is_alarming(frame, self._layout):
             self._reception.add_frame(frame)
 
@@ -162,7 +162,7 @@ class BusMonitor:
 
 
 def is_alarming(frame: Frame, layout: Layout) -> bool:
-    """Returns True if a frame must be seen however old it is: a controller's error, or a command that is not ours."""
+    """Returns True for a frame that counts at any age: an error of the controller, or a command of another sender."""
     return frame.error or (frame.identifier == layout.command.identifier and not (frame.own or frame.extended))
 
 
@@ -177,15 +177,15 @@ def listen(
 ) -> None:
     """Listen until enough pairs have come and the last of them are good enough, or until a deadline.
 
-    What was on the bus before this was called may have waited in the kernel for long: of that, alarming frames count.
+    Frames from before the call may have waited in the kernel for long: of these only alarming frames count.
 
     Args:
         monitor: takes the frames.
         receive: gives the next frame, or None at a deadline.
-        clock: the time that those deadlines are on.
+        clock: clock of these deadlines.
         period_ns: the sampling period [ns].
         deadline_ns: monotonic [ns].
-        enough: True if a sample that was in hand at a time (monotonic [ns]) is as it should be.
+        enough: True if a sample, received at a time (monotonic [ns]), is good.
         stop_requested: True if the operator has ended the command.
     """
     begin_ns = now_ns = clock.now_ns()

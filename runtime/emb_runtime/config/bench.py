@@ -127,7 +127,11 @@ class Sensors:
     def __str__(self) -> str:
         if self.velocity_lag is not None:
             return f"an observer's, {self.velocity_lag * 1e3:g} ms late at most"
-        return "a sensor's" if self.velocity == "sensor" else f"an observer's, of at least {self.bandwidth:g} rad/s"
+        return (
+            "a sensor's"
+            if self.velocity == "sensor"
+            else f"an observer's, with a bandwidth of at least {self.bandwidth:g} rad/s"
+        )
 
 
 @dataclass(frozen=True)
@@ -253,7 +257,7 @@ class Systematic(SharedErrors):
     stiffness_ripple: NotNegative = 0.003  # Share of the stiffness that changes once a turn of the motor
     current_gain: NotNegative = 0.01  # Share by which k_m is larger at the limit of the current
     dead_current: NotNegative = 0.01  # Current by which less acts than the node reports, in either direction [A]
-    drift: NotNegative = 0.003  # Change of each parameter from the begin of a run to its end, as a share of it
+    drift: NotNegative = 0.003  # Change of each parameter from the start of a run to its end, as a share of it
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,8 +18,8 @@ class RunningEstimate:
         self.estimator = Estimator(bench)
         self.numbers: tuple[float, ...] = ()  # The latest estimate; empty if there is none
         self.goal_ns: int | None = None
-        """Device time from the first sample to that at which the stop condition was met [ns]; from then on the brake
-        returns home."""
+        """Device time from the first sample to the one that met the stop condition [ns]; the brake then returns
+        home."""
         self._condition = condition
         self._available = not homing and bool(estimated(bench))  # there is an estimate, and it was finite so far
 

@@ -10,23 +10,23 @@ from emb_runtime.errors import UsageError, near
 from emb_runtime.estimator.estimate import NORMAL_95
 from emb_runtime.numbers import in_percent
 
-COUNT = len(PARAMETER_NAMES)  # An estimate has so many values, then their deviations
+COUNT = len(PARAMETER_NAMES)  # Number of values of an estimate; their deviations follow
 REACHED = "KNOWN_ENOUGH"  # Code of its event in the log
 
 
 @dataclass(frozen=True)
 class StopCondition:
-    """Repeatabilities, each as a part of its value, that the estimate has to fall below."""
+    """Upper bounds on the repeatabilities, each relative to its value, at which an experiment ends."""
 
     text: str  # Text as :func:`parse_stop_condition` reads it
     parts: tuple[tuple[int, float], ...]  # Indices of parameters, and the bound of each repeatability; 0.01 is 1 %
 
     def reached(self, estimate: Sequence[float]) -> bool:
-        """Returns True if all repeatabilities are below their bounds. One of zero is an error."""
+        """Returns True if all repeatabilities are below their bounds; one of zero, an error, is not."""
         return all(0.0 < NORMAL_95 * estimate[COUNT + at] < part * abs(estimate[at]) for at, part in self.parts)
 
     def describe(self, estimate: Sequence[float]) -> str:
-        """Repeatabilities and their bounds in words, of a condition that is met."""
+        """Text with the repeatabilities and their bounds, for a condition that is met."""
         shares = ((at, NORMAL_95 * estimate[COUNT + at] / abs(estimate[at]), part) for at, part in self.parts)
         return "repeatability " + ", ".join(
             f"{PARAMETER_NAMES[at]} ± {in_percent(share)} of {in_percent(part, 3)}" for at, share, part in shares
@@ -36,7 +36,7 @@ class StopCondition:
 def parse_stop_condition(text: str, names: Sequence[str]) -> StopCondition:
     """Read a stop condition such as ``k_1=1%,f_v=5%`` on the parameters that are estimated."""
     if not names:
-        raise UsageError("--stop-when: the bench's [estimator] leaves no parameter open: leave it out")
+        raise UsageError("--stop-when: the bench's [estimator] estimates no parameter: leave the option out")
     parts: dict[int, float] = {}
     for item in text.split(","):
         name, _, percent = item.partition("=")

@@ -1,4 +1,4 @@
-"""Translation between a drive's frames and ours: current to bytes, bytes to samples. cantools does the codec.
+"""Translation of a drive's frames: current to bytes, bytes to samples. cantools is the codec.
 
 Pure, but for :class:`Outlet`, which hands each frame to the second guard.
 """
@@ -76,7 +76,7 @@ class Encoder:
 
 
 class Outlet:
-    """Sends frames to a drive, with currents up to a limit [A]. One for which the bus has no room is lost, and counted.
+    """Sends frames to a drive, with currents up to a limit [A]; a frame that the full queue refuses is counted.
 
     Its methods raise BusError if the bus is lost.
     """
@@ -91,7 +91,7 @@ class Outlet:
         """Largest current of the latest run [A]."""
 
     def command(self, current: float) -> bool:
-        """Send a current [A]; returns True if it was sent. One that is refused raises FrameError or WireGuardError."""
+        """Send a current [A]; returns True if it was sent. A refused current raises FrameError or WireGuardError."""
         try:
             carried = self.guard.command(self._encoder.command(current), current)
         except TransmitQueueFullError:
@@ -112,9 +112,9 @@ class Outlet:
         return ""
 
     def applied(self, sample: DriveSample) -> float:
-        """Current in the period that ended [A]: as measured, or as commanded where the measurement cannot tell them."""
+        """Current in the period that ended [A]: measured; commanded if both agree within a step of the measurement."""
         measured, commanded = self._mapping.current, self.currents[0 if self._mapping.polled else 1]
-        if measured is None:  # and of a poll the answer is packed before the command is obeyed
+        if measured is None:  # a polled drive packs its answer before it applies the command
             return commanded
         step = measured.field.step(sample.current / measured.factor) * abs(measured.factor)
         return commanded if abs(sample.current - commanded) <= step else sample.current
@@ -123,8 +123,8 @@ class Outlet:
 class Receiver:
     """Makes samples of the drive's frames.
 
-    A sample is complete when every message with a part of it has come once, all within ``pair_within``. By a message's
-    counter, so many frames missing in a row as are ``tolerated`` are too many; fewer if they are a share.
+    A sample is complete when each of its messages has come once, all within ``pair_within``. A leaky count limits the
+    frames that are missing by a message's counter: ``tolerated`` in a row are too many, and so is a large share.
     """
 
     def __init__(self, mapping: Mapping, tolerated: int) -> None:
@@ -139,18 +139,18 @@ class Receiver:
         self._waiting: dict[str, tuple[dict[str, float], int]] = {}
         self._turns = 0.0
         self._wrapped: float | None = None
-        self.last_state = DriveState.UNKNOWN  # State by the latest message with it, however old that is
+        self.last_state = DriveState.UNKNOWN  # State in the latest message with it, of any age
         self.state_ns = 0
         """Arrival of the latest message with the state [ns]."""
         self.rejected: dict[str, int] = {}
-        """Number of frames that were not believed, by reason."""
+        """Number of rejected frames by reason."""
         self.refusal = ""
-        """Latest frame that was not believed, with what it had and what it should have; empty if all were."""
+        """Latest rejected frame, with the found and the expected value; empty if there is none."""
         self.reported = ""  # State in the latest message, and the expected ones
 
     @property
     def frames_missing(self) -> str:
-        """Name of a message of which too many frames did not come, by its counter; empty if there is none."""
+        """Name of a message with too many missing frames by its counter; empty if there is none."""
         return next((name for name, missing in self._missing.items() if missing.exceeded), "")
 
     def state(self, now_ns: int) -> DriveState:
@@ -161,13 +161,13 @@ class Receiver:
         return self.last_state
 
     def add_frame(self, frame: Frame) -> DriveSample | None:
-        """Add a frame from the bus; gives the sample that it completes.
+        """Add a frame from the bus; returns the sample that it completes.
 
-        A frame that is none of the drive's is passed over; one that cannot be believed is counted.
+        Frames of other nodes are ignored; invalid frames are counted.
         """
         sample = None
         for info in self._infos.get((frame.extended, frame.identifier), ()):
-            if frame.own or frame.error or not _is_of(info, frame) or (values := self._believed(info, frame)) is None:
+            if frame.own or frame.error or not _is_of(info, frame) or (values := self._valid(info, frame)) is None:
                 continue
             if self._mapping.state is not None and info.name == self._mapping.state.message:
                 self._take_state(values, frame.time_ns)
@@ -175,8 +175,8 @@ class Receiver:
                 sample = self._pair(info.name, values, frame.time_ns) or sample
         return sample
 
-    def _believed(self, info: MessageInfo, frame: Frame) -> dict[str, float] | None:
-        """Values of a frame, None if it is not to be believed."""
+    def _valid(self, info: MessageInfo, frame: Frame) -> dict[str, float] | None:
+        """Values of a valid frame, else None."""
         if frame.remote or len(frame.data) != info.length:
             lengths = f"{len(frame.data)} bytes came, the DBC has {info.length}"
             self._reject("wrong length", f"{info.name}: wrong length: {lengths}")
@@ -240,9 +240,9 @@ class Receiver:
         return DriveSample(self._angle(angle), velocity, current[0] if current else math.nan, begun_ns)
 
     def _angle(self, value: float) -> float:
-        """Angle [rad]; one that begins anew after a turn is continued from the last one, the first within half a turn.
+        """Angle [rad]; one that wraps around is continued from the last one, the first within half a turn.
 
-        Between two samples it must travel less than half a turn.
+        Between two samples the motor must turn by less than half a turn.
         """
         measured = self._mapping.angle
         if measured.wrap:
@@ -253,7 +253,7 @@ class Receiver:
 
 
 def conditions_in(mapping: Mapping, frame: Frame) -> dict[str, float]:
-    """Temperature [degC] and supply voltage [V] in a frame of the drive, by name, as far as they can be believed."""
+    """Temperature [degC] and supply voltage [V] in a frame of the drive, by name, if they are valid."""
     found = {}
     for name, one in mapping.conditions.items():
         info = mapping.messages[one.message]
@@ -268,6 +268,6 @@ def conditions_in(mapping: Mapping, frame: Frame) -> dict[str, float]:
 
 
 def _is_of(info: MessageInfo, frame: Frame) -> bool:
-    """True if a frame of the message's identifier has its value of the multiplexor, or is too short to tell."""
+    """True if a frame of the message's identifier has its multiplexor value, or is too short to have one."""
     is_complete = not frame.remote and len(frame.data) == info.length
     return info.page is None or not is_complete or raw_value(info.page, frame.data) == info.page_value

@@ -1,7 +1,8 @@
-"""The second guard: the one place that puts a frame on the drive's bus.
+"""The second guard: the only code that sends a frame on the drive's bus.
 
-It takes the frame as bytes, reads them bit by bit (:mod:`emb_runtime.drives.signals`, not the encoder's library), and
-compares with what was meant: amperes, the message's other signals, checksum and counter. It rejects; it never mends.
+It decodes the bytes of the frame bit by bit (:mod:`emb_runtime.drives.signals`, not the encoder's library), and
+compares them with the intended current, the message's other signals, checksum and counter. It rejects frames and does
+not correct them.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ ROUNDING = 1e-6  # Part of a step by which floating-point numbers may be off, be
 
 
 class WireGuardError(SafetyStopError):
-    """A frame that the second guard did not let out."""
+    """A frame that the second guard did not send."""
 
 
 class WireGuard:
-    """Lets frames out to the drive that agree with what was meant, with currents up to a limit [A].
+    """Sends frames to the drive if they agree with the intended values, with currents up to a limit [A].
 
-    Nobody else holds ``send``, which puts a frame on the bus.
+    No other object has ``send``, which puts a frame on the bus.
     """
 
     def __init__(self, mapping: Mapping, limit: float, send: Callable[[Frame], None]) -> None:
@@ -42,7 +43,7 @@ class WireGuard:
         """Check a command against the current that it is to carry [A], and send it.
 
         Returns:
-            The current that the bytes say, which may differ from the one meant by half a step [A].
+            The current in the bytes, which may differ from the intended one by half a step [A].
 
         Raises:
             WireGuardError: nothing was sent.
@@ -114,7 +115,7 @@ class WireGuard:
 
 
 def _agrees(value: float, meant: float, step: float) -> bool:
-    """Returns True if a value is the step nearest to the one meant, or as near as floating-point numbers are."""
+    """Returns True if a value is the step nearest to the intended one, within floating-point accuracy."""
     return abs(value - meant) <= (0.5 + ROUNDING) * step + EXACT * abs(meant)
 
 

@@ -1,9 +1,9 @@
 """The recorder process: takes records out of the ring and writes them into one MCAP file.
 
-``python -m emb_runtime.log.recorder_process RING_FD HEADER_FD``, started by :class:`emb_runtime.log.recorder.Recorder`
-and by nobody else. It answers on standard output, one JSON object per line: first ``ready`` or ``error``, at the end
-the state of the file. Its standard input carries the trailer; if it ends without one, the runtime has died, and the
-file is finished all the same.
+``python -m emb_runtime.log.recorder_process RING_FD HEADER_FD``, started only by
+:class:`emb_runtime.log.recorder.Recorder`. It answers on standard output, one JSON object per line: first ``ready`` or
+``error``, at the end the state of the file. Its standard input carries the trailer. If the input ends without one, the
+runtime has died; the file is then completed, too.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from emb_runtime.system.realtime import step_back
 
 CHUNK = 256 * 1024  # Bytes after which a chunk is closed
 FLUSH = 0.1
-"""Longest time that a record stays out of the file [s]: what killing this process can cost, and what a viewer waits."""
+"""Longest time until a record is in the file [s]: the loss if this process is killed, and the delay of a viewer."""
 POLL = 0.005  # Time between two looks into the ring [s]
 BATCH = 128  # Records between two looks at the clock
 
@@ -62,7 +62,7 @@ DIED = "the runtime process died"  # Exit reason in a log whose runtime ended wi
 
 
 class LogWriter:
-    """Turns records into MCAP messages. Writes to what it is given, reads no clock."""
+    """Converts records to MCAP messages, which it writes to ``output``. Reads no clock."""
 
     def __init__(self, output: BinaryIO, header: LogHeader) -> None:
         self._messages = {message.identifier: message for message in header.messages}
@@ -74,7 +74,7 @@ class LogWriter:
         self._schemas: dict[str, int] = {}
         self._sequences: dict[int, int] = {}
         self.messages = 0  # Messages written
-        self.undecoded = 0  # Frames that are no valid frame of ours: they are in the log as they were on the bus only
+        self.undecoded = 0  # Frames that are not valid frames of the DBC: the log has them as raw frames only
         begin = self._offset + header.start_ns
         for name, entries in header.metadata.items():
             self._add_metadata(name, entries)
@@ -84,7 +84,7 @@ class LogWriter:
         for topic in topics.TOPICS:
             if topic not in OPTIONAL or topic in there:
                 self._register(topic)
-        # A chunk needs a message to be written, and whoever reads a cut file needs this chunk.
+        # A chunk is written only with a message, and a reader of a cut file needs this chunk.
         self.write(ClockRecord(header.start_ns, begin), begin)
         self.flush()
 
@@ -110,7 +110,7 @@ class LogWriter:
         self._add(topic, log_time, record.time_ns, dict(zip(names, values, strict=True)))
 
     def write_frame(self, topic: str, record: FrameRecord, log_time: int) -> None:
-        """Write a frame as it is; one of a mapped drive's bus has another meaning."""
+        """Write a raw frame, without decoding it."""
         frame = record.frame
         values = {
             "id": frame.identifier,
@@ -130,7 +130,7 @@ class LogWriter:
 
     def finish(self, trailer: Mapping[str, str]) -> None:
         """Write the outcome and close the file's structure."""
-        self.flush()  # a log that is cut before its last message must not say how the run ended
+        self.flush()  # a log that is cut before its last message must not contain the outcome
         self._add_metadata(END, {**trailer, "undecoded_frames": str(self.undecoded)})
         self._mcap.finish()  # type: ignore[no-untyped-call]
 
@@ -157,23 +157,23 @@ class LogWriter:
 
 
 class NewFile(io.FileIO):
-    """A new file that knows the size and the checksum of all that was written to it."""
+    """A new file that records the size and the checksum of all that was written to it."""
 
     def __init__(self, path: Path) -> None:
-        """Make it; raises OSError, FileExistsError where it exists."""
+        """Create the file; raises OSError, FileExistsError if it exists."""
         super().__init__(path, "xb")
         self.path = path
         self._size = self._checksum = 0
 
     def write(self, data: Any) -> int:
-        """Write as much as can be written; gives the number of bytes."""
+        """Write as much as possible; returns the number of bytes."""
         count = super().write(data)
         self._checksum = zlib.crc32(memoryview(data)[:count], self._checksum)
         self._size += count
         return count
 
     def is_as_written(self) -> bool:
-        """Returns True if what its path leads to holds all that was written, and nothing else."""
+        """Returns True if the file at its path contains all that was written, and nothing else."""
         checksum = 0
         try:
             with open_regular(self.path) as file:
@@ -202,7 +202,7 @@ class Recording:
         self.writer = LogWriter(self._output, header)
         self.lost = 0  # Records that could not be written
         self.error = ""  # The first failure to write
-        self.drive_error = ""  # Loss of the drive's bus, which the file outlives
+        self.drive_error = ""  # Loss of the drive's bus, which does not end the recording
 
     def run(self) -> dict[str, Any]:
         """Record until the trailer comes or the parent is gone; then write the rest and report."""
@@ -242,7 +242,7 @@ class Recording:
     def finish(self, trailer: dict[str, str]) -> dict[str, Any]:
         """Write the rest, close the file and report."""
         self.drain()
-        self.lost += len(self._ring)  # only a producer that died between two stores leaves any
+        self.lost += len(self._ring)  # not empty only if the producer died between two stores
         trailer["dropped_records"] = str(self._ring.dropped + self.lost)
         if self.drive_error:
             trailer["drive_bus_error"] = self.drive_error
@@ -259,7 +259,7 @@ class Recording:
         os.fsync(self._output.fileno())
 
     def _listen(self, wait: float) -> dict[str, str] | None:
-        """The trailer, once it is there; the one for a dead parent, once that is gone."""
+        """The trailer when it has come, or the one for a dead parent when the parent has ended; else None."""
         readable, _, _ = select.select([0], [], [], wait)
         if readable:
             data = os.read(0, 65536)
@@ -288,12 +288,12 @@ class Recording:
 
     def _write(self, kind: int, payload: bytes) -> None:
         record = unpack(kind, payload)
-        # Nothing is written before it happened; in simulated time, which stands still, that is all there is to it.
+        # A record is not logged before its own time; in simulated time, which does not advance, it is logged at it.
         self._now = max(self._now, record.time_ns + self._offset)
         self.writer.write(record, self._now)
 
     def _guarded(self, action: Callable[[], None]) -> None:
-        """Do an action; store its failure. The ring is emptied all the same: a full one would drop records."""
+        """Do an action; store its failure. The ring is still emptied, as a full one would drop records."""
         if self.error:
             return
         try:
@@ -304,7 +304,7 @@ class Recording:
 
 
 def begin_recording(ring: Ring, document: Mapping[str, Any]) -> Recording:
-    """Make the file, with its first chunk; raises LogError where that cannot be."""
+    """Create the file, with its first chunk; raises LogError if that fails."""
     try:
         file = NewFile(Path(document["path"]))
     except FileExistsError as err:

@@ -21,7 +21,7 @@ _COMMENTS: Final = {
     for place in _FILE.source_code_info.location
     if place.leading_comments or place.trailing_comments
 }
-"""Comments by the place of what they describe: of message i (4, i), of its field j (4, i, 2, j)."""
+"""Comments by the path of the described element: (4, i) for message i, (4, i, 2, j) for its field j."""
 
 TOPICS: Final = {
     **dict(ring_buffer.TOPICS.values()),
@@ -39,7 +39,7 @@ def message_class(message: str) -> Any:
 
 
 def schema(message: str) -> bytes:
-    """A message and the enumerations, as a reader without our code needs them: a serialised FileDescriptorSet."""
+    """A message and the enumerations as a serialised FileDescriptorSet, so that any reader can decode the log."""
     file = descriptor_pb2.FileDescriptorProto(name=f"emb/{message}.proto", package="emb", syntax="proto3")
     file.message_type.extend(m for m in _FILE.message_type if m.name == message or m.enum_type)
     return descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()

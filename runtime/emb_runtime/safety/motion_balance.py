@@ -98,9 +98,9 @@ def balance_model(bench: Bench) -> BalanceModel:
 
 
 class Stretch(NamedTuple):
-    """Sums over the velocities of a stretch of sliding, the one at its begin included; lists are changed in place."""
+    """Sums over the velocities of a stretch of sliding, the one at its start included; lists are changed in place."""
 
-    total: list[float]  # Sum of the rows since its begin, shape [WIDTH]: the velocity gained, and what it consists of
+    total: list[float]  # Sum of the rows since its start, shape [WIDTH]: the velocity gained, and what it consists of
     first: list[float]  # Sum of ``total`` over the velocities, shape [WIDTH]
     second: Rows  # Sum of its products: upper triangle of shape [TERMS, WIDTH]
 
@@ -185,7 +185,7 @@ def take(model: BalanceModel, state: State, follows: bool, angle: float, velocit
         _add_products(stretch.second, stretch.total)
         periods += 1
         stretches += 0 if length else 1
-        length = max(length, 1) + 1  # with the velocity at its begin, where all sums are 0
+        length = max(length, 1) + 1  # with the velocity at its start, where all sums are 0
     elif length:
         centred = _centred(state)
         stretch, length = _new_stretch(), 0

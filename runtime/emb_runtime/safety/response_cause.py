@@ -147,7 +147,7 @@ def observer_bandwidth(model: ResponseModel, rows: Sequence[Row]) -> float:
 def _observer_misfit(model: ResponseModel, rows: Sequence[Row], bandwidth: float) -> float:
     """Sum of the squared differences of the velocities from those of an observer of the angles [rad²/s²].
 
-    The observer's angle follows from two velocities: at the begin and where a sample is missing it is unknown.
+    The observer's angle follows from two velocities: at the start and where a sample is missing it is unknown.
     """
     ts, follows = model.sample_time, False
     alpha, beta = observer_gains(bandwidth, model.sample_time)

@@ -1,14 +1,15 @@
 """Monitor of the sensors over time: an error that is small in each sample and grows.
 
-The reception checks each step of the angle against the velocity; a slow drift passes it. Here two errors are summed up,
-each in both directions and from its last zero on (a CUSUM: Page, Continuous inspection schemes, Biometrika 41, 1954):
+The reception checks each step of the angle against the velocity; a slow drift passes this check. Here two errors are
+summed in both directions, each from its last zero on (a CUSUM: Page, Continuous inspection schemes, Biometrika 41,
+1954):
 
 * **Travel**: the angle against the integral of the velocity over the device's time.
 * **Motion**: the change of the velocity against what any brake of the shield's set can do with the current that acted.
 
-While nothing has shown that a positive current moves the brake in the positive direction, the same sums are formed for
-a motor, a sensor or both with the wrong sign. Once they have excluded these, the polarity is confirmed. Until the
-motion has shown its sign, a current is limited to what friction alone can stop, should the sign be wrong.
+Until the motion has shown that a positive current moves the brake in the positive direction, the same sums are also
+formed for a motor, a sensor or both with the wrong sign. When the sums exclude these, the polarity is confirmed. Until
+the motion has shown its sign, the current is limited so that friction alone can stop the brake if the sign is wrong.
 
 :func:`judge` is a plain scalar function from one state to the next, so that the runtime, a simulation and a compiled
 batch run the same code. Formulas, thresholds and what they cannot see: ``docs/explanation/sensor-monitor.md``.
@@ -33,7 +34,7 @@ OUTSIDE_SET: Final = 2
 REVERSED: Final = 3
 
 Currents = tuple[float, float, float, float, float, float]
-"""One number of each of the last OLDEST_FRAME + 1 periods, newest first [A]."""
+"""One current for each of the last OLDEST_FRAME + 1 periods, newest first [A]."""
 
 
 class Cusum(NamedTuple):
@@ -83,7 +84,7 @@ def begin_monitor(angle: float, velocity: float) -> State:
 
 
 def add(sums: Cusum, error: float, slack_up: float, slack_down: float) -> Cusum:
-    """Add an error, less what is allowed of it in each direction."""
+    """Add an error, less the slack of each direction."""
     up, down = sums
     up, down = up + error - slack_up, down - error - slack_down
     return Cusum(up if up > 0.0 else 0.0, down if down > 0.0 else 0.0)
@@ -100,22 +101,23 @@ def judge(
     command: float,
     reported: float,
 ) -> tuple[State, int]:
-    """Judge one more sample.
+    """Check one more sample.
 
     Args:
-        law: of the shield.
+        law: parameters of the shield.
         limits: the thresholds.
-        state: after the sample before.
-        elapsed: time since the sample before, by the device's clock [s].
+        state: state after the previous sample.
+        elapsed: time since the previous sample, by the device's clock [s].
         angle: measured [rad].
         velocity: measured [rad/s].
-        obeyed: by the node's report the command which answered the sample before acted.
+        obeyed: True if, by the node's report, the command for the previous sample was applied.
         command: that command; 0 if none was sent [A].
-        reported: the current that the node reports of the period [A].
+        reported: current that the node reports for the period [A].
 
     Returns:
-        The next state, and HONEST, CONTRADICTING (angle and velocity do not fit each other), OUTSIDE_SET (the velocity
-        does not fit the current, for any brake of the set), or REVERSED. A number that is no measurement contradicts.
+        The next state, and HONEST (no fault), CONTRADICTING (angle and velocity do not fit each other), OUTSIDE_SET
+        (the velocity does not fit the current, for any brake of the set), or REVERSED. A value that is not finite, or
+        too large for a measurement, is CONTRADICTING.
     """
     size = abs(angle) + abs(velocity) + abs(command) + abs(reported)
     if not (size <= BELIEVABLE and 0.0 < elapsed <= BELIEVABLE):  # this way round, NaN is no measurement
@@ -174,22 +176,22 @@ def judge(
 def largest_current(law: ShieldLaw, limits: SensorThresholds, state: State, limit: float) -> float:
     """Largest current that may be sent, at most ``limit`` [A].
 
-    Until the motion has shown its sign, it is what friction can stop if that is wrong.
+    Until the motion has shown its sign, friction has to be able to stop the brake if the sign is wrong.
     """
     if state.obeys:
         return limit
     stoppable = _stoppable_current(law, limits, state)
-    if abs(state.velocity) <= law.velocity_noise:  # what rests may be moved; friction stops what moves
+    if abs(state.velocity) <= law.velocity_noise:  # at rest, enough to move the brake; friction stops a moving one
         stoppable = max(stoppable, limits.first_current)
     return min(limit, stoppable)
 
 
 def coasting_time(law: ShieldLaw, angle: float, velocity: float, unseen: float = 0.0) -> float:
-    """Time in which friction alone stops any brake of the set near the origin [s]; 0 where it may not.
+    """Time in which friction alone stops any brake of the set near the origin [s]; 0 where it cannot be relied on.
 
-    The signs of the sensors do not matter. With the least friction f, the strongest spring w and the distance x it is
-    max(2 v / f, (v + unseen) / (f − w x)): in the first term the spring helps the motion by half of f. What is
-    ``unseen``, by :func:`unseen_speed`, only makes the wait longer: the limit of the first move has kept the distance.
+    The signs of the sensors do not matter. With the least friction f, the strongest spring w and the distance x, the
+    time is max(2 v / f, (v + unseen) / (f − w x)). In the first term the spring drives the motion with half of f. The
+    speed ``unseen``, by :func:`unseen_speed`, only lengthens the time: the first move's limit includes the distance.
     """
     box, friction = law.box, law.box.friction_low
     speed = abs(velocity) + law.velocity_noise
@@ -218,24 +220,24 @@ def unseen_speed(law: ShieldLaw, limits: SensorThresholds, state: State) -> floa
 
 
 def _oldest(law: ShieldLaw) -> int:
-    """Number of periods before the last two whose currents the velocity may show only now: late frames, an observer."""
+    """Number of periods before the last two whose currents may still change the velocity: late frames, an observer."""
     if law.delay.observer == 0.0:
         return law.age_high
     return min(law.age_high + int(1.0 / law.delay.observer), OLDEST_FRAME)
 
 
 def _held_stroke(law: ShieldLaw, friction: float) -> float:
-    """Distance from the origin within which such a friction holds any brake of the set [rad]."""
+    """Distance from the origin within which a friction holds any brake of the set [rad]."""
     return min(-law.bottom, friction / law.box.spring_high)
 
 
 def _stoppable_current(law: ShieldLaw, limits: SensorThresholds, state: State) -> float:
-    """Largest current after which :func:`coasting_time` still finds that friction stops a brake of either sign [A].
+    """Largest current after which friction still stops a brake of either sign, by :func:`coasting_time` [A].
 
-    Reckons with the strongest motor of the set, with what has acted and is not in the sample yet (late frames, a
-    current that lags, an observer), with the errors of two samples, and with one period in which the node gets no
-    command and its stop, with the wrong sign, drives the brake. 0 where there is no such current; the constant one so
-    far from the origin that friction alone is no stop at all, as where a way home begins.
+    Assumes the strongest motor of the set, the currents that the sample does not show yet (late frames, a current that
+    lags, an observer), the errors of two samples, and one period without a command, in which the node's stop drives the
+    brake with the wrong sign. 0 if there is no such current. Farther from the origin, where friction alone cannot stop
+    the brake (as at the start of a way home), it is the constant ``first_current``.
     """
     ts, box, friction = law.sample_time, law.box, law.box.friction_low
     speed: float = abs(state.velocity) + law.velocity_noise + unseen_speed(law, limits, state)
@@ -250,15 +252,15 @@ def _stoppable_current(law: ShieldLaw, limits: SensorThresholds, state: State) -
 
 
 def lag_angle(limits: SensorThresholds, gained: float) -> float:
-    """Angle beyond the integral of a velocity that has gained so much, by its lag; by its lead if it has lost [rad]."""
+    """Allowed angle beyond the integral of the velocity [rad]: by lag for a gained velocity, by lead for a lost one."""
     lag, lead = limits.lag * gained, -limits.lead * gained
     return lead if lead > lag else lag
 
 
 def _gain(law: ShieldLaw, slowest: float, drive: float) -> float:
-    """Most that the velocity of a brake of the set gains in one sample, from ``slowest`` or above [rad/s].
+    """Largest velocity gain of a brake of the set in one sample, from ``slowest`` or above [rad/s].
 
-    The faster the brake, the less: friction takes more, and helps where it moves against the drive.
+    The gain falls with the velocity: friction opposes a motion with the drive, and supports the drive against it.
     """
     return fastest_next(law, slowest, slowest, drive) - slowest + VELOCITY_PAD
 
@@ -273,9 +275,9 @@ def _caused(
     vl: float,
     vh: float,
 ) -> tuple[float, float]:
-    """Least and greatest current of the periods since the sample before [A].
+    """Least and greatest current of the periods since the previous sample [A].
 
-    Where no command acted, the node braked by itself, or let go.
+    In a period without a command the node braked by itself, or its current was 0.
     """
     if obeyed and periods == 1:
         low = high = command
@@ -297,10 +299,10 @@ def _caused(
 def _acting(
     law: ShieldLaw, lows: Currents, highs: Currents, flowing: tuple[float, float], low: float, high: float
 ) -> tuple[float, float, tuple[float, float]]:
-    """Least and greatest current that may have caused the change between two samples; what may flow after it [A].
+    """Least and greatest current that may have caused the change between two samples, and that may flow afterwards [A].
 
-    That of the period before counts as well: a measured velocity lags. So do those of older ones where frames may be
-    late, or an observer derives the velocity.
+    The current of the previous period counts, too, as a measured velocity lags. With late frames or an observer the
+    currents of older periods count as well.
     """
     delay = law.delay
     least, most = low, high
@@ -354,14 +356,14 @@ class SensorMonitor:
         return self._state.obeys
 
     def coasting_time(self, sample: SensorSample) -> float:
-        """Time for which friction alone is to stop the brake, as its node might drive it [s]."""
+        """Time in which friction alone stops the brake [s]; 0 once the node's stop is known to brake."""
         if self.obeys:
             return 0.0
         law, limits, state = self._law, self._limits, self._state
         return coasting_time(law, sample.angle, sample.velocity, unseen_speed(law, limits, state))
 
     def check(self, elapsed: float, sample: SensorSample, obeyed: bool, command: float) -> None:
-        """Take one more sample, as :func:`judge`; raises StopError if the sensors cannot be right."""
+        """Check one more sample, as :func:`judge`; raises StopError if the sensors cannot be right."""
         self._state, verdict = judge(
             self._law, self._limits, self._state, elapsed, sample.angle, sample.velocity, obeyed, command,
             sample.applied_current,

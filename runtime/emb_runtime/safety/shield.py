@@ -1,22 +1,22 @@
-"""The envelope shield: from what the policy wants to a current from which every brake of a box can still be held.
+"""The envelope shield: limits a requested current so that every brake of the set can still be stopped.
 
 :func:`shield` is one pure scalar function of a bench's law (:func:`emb_runtime.safety.shield_design.make_law`), the
-newest measurement, the last own commands and the step. It runs as it is in the runtime and, compiled by
-``emb_bench.compiled``, bit for bit the same in the training environment.
+newest measurement, the last commands sent and the step. The runtime runs it as plain Python or compiled; the training
+environment runs it compiled by ``emb_bench.compiled``, with bit-identical results.
 
 The argument, in short (in full, with what it does not cover, in ``docs/explanation/shield.md``):
 
 * A measurement, ± a few sigma, is a box of states. :func:`successor` maps that box and a current to a box that contains
   what any brake of the parameter box can do in one sample, under forward Euler and under the exact flow.
-* The envelope asks that a state can be stopped by full braking of the weakest brake before the angle limits, and that
-  its speed is below the limit. The window of currents for which the whole successor box lies in the envelope has a
-  closed form (:func:`_highest_current`); what the policy wants is clipped to it.
-* Where the window is empty on one side, the clip is full braking. Envelope plus ``angle_margin`` contains a set that
-  full braking, the node's damped stop and the window all map into itself. So a period in which the node does not get
-  its answer, and a kill at any moment, are harmless as well.
-* A current that lags and a drive that can only let go have windows of their own, late frames the intersection of one
-  per age.
-* By the worst brake's arrival time the shield takes over to be home at the end of the experiment.
+* A state is in the envelope if full braking of the weakest brake stops it before the angle limits, and if its speed is
+  below the limit. The window of currents for which the whole successor box lies in the envelope has a closed form
+  (:func:`_highest_current`); the requested current is clipped to it.
+* Where the window is empty on one side, the clip is full braking. The envelope with ``angle_margin`` contains a set
+  that is invariant under full braking, the node's damped stop and the window. So the limits also hold if the node gets
+  no answer in a period, or if the process is killed at any moment.
+* A current that lags and a drive that can only switch its current off have windows of their own. With late frames the
+  window is the intersection over all ages.
+* The shield takes over in time for the worst brake to be home at the end of the experiment.
 
 All accelerations are torques over the inertia [rad/s²]; a name that ends in ``_low``/``_high`` is a bound of the box.
 Functions that run in most cycles have ``b if b < a else a`` in place of ``min(a, b)``, and likewise for ``max``: it
@@ -35,35 +35,35 @@ LIMITED: Final = 2
 RETURNING: Final = 4
 
 BELIEVABLE: Final = 1e6
-"""A measurement beyond this (or NaN) is no measurement; far beyond all limits, far below where squares overflow."""
+"""A measurement above this (or NaN) is invalid; far beyond all limits, far below where squares overflow."""
 
-PIECES: Final = 8  # Trapezoids of the way home that may be coasted
-PAST: Final = 5  # Own commands that :func:`shield` may want to know
+PIECES: Final = 8  # Trapezoids for the way home of a coasting brake
+PAST: Final = 5  # Number of commands in ``past``
 Past = tuple[float, float, float, float, float]
-"""The last own commands, newest first [A]; 0 where nothing was sent. A law for fresh frames does not look at them."""
+"""The last commands sent, newest first [A]; 0 where nothing was sent. A law for fresh frames does not use them."""
 NO_PAST: Past = (0.0, 0.0, 0.0, 0.0, 0.0)
 States = tuple[float, float, float, float]
 """A box of states: least and greatest angle [rad], least and greatest velocity [rad/s]."""
 
 
 def shield(law: ShieldLaw, angle: float, velocity: float, wanted: float, past: Past, step: int) -> tuple[float, int]:
-    """The current to send in place of the wanted one, and why it differs.
+    """The current to send in place of the requested one, and why it differs.
 
-    A ``wanted`` that is not finite counts as 0 A. Where the measurement or an own command is NaN, infinite or absurd,
-    there is no box to reason about: the answer is the damped stop if the velocity is believable, else 0 A. The loop
-    refuses such samples before they come here, and the node then brakes by itself.
+    A request that is not finite counts as 0 A. If the measurement or a past command is NaN, infinite or above
+    ``BELIEVABLE``, the result is the damped stop if the velocity is valid, else 0 A. The loop rejects such samples
+    earlier, and the node then brakes by itself.
 
     Args:
         law: of the bench.
         angle: newest measurement [rad].
         velocity: newest measurement [rad/s].
-        wanted: by the policy [A].
-        past: the last own commands, newest first [A].
+        wanted: current requested by the policy [A].
+        past: the last commands sent, newest first [A].
         step: index of this command in the experiment, 0 first.
 
     Returns:
-        The current [A], finite and within the limit, and bits of ``records.Reason``: LIMITED (what was wanted did not
-        fit), RETURNING (the way home has taken over).
+        The current [A], finite and within the limit, and bits of ``records.Reason``: LIMITED (the request was
+        outside the window), RETURNING (the way home has taken over).
     """
     if not _believable(law, angle, velocity, past):
         return _blind_current(law, velocity), LIMITED
@@ -81,10 +81,10 @@ def shield(law: ShieldLaw, angle: float, velocity: float, wanted: float, past: P
 
 
 def window(law: ShieldLaw, angle: float, velocity: float, past: Past) -> tuple[float, float]:
-    """Least and greatest current from which every brake of the set can still be held, whatever comes after them [A].
+    """Least and greatest current after which every brake of the set can still be stopped within the limits [A].
 
-    Both are within the limit [A]. They are the same where only full braking is left, and where the measurement or an
-    own command is NaN, infinite or absurd: then the damped stop, or 0 A.
+    Both are within the current limit. They are equal if only full braking is possible. If the measurement or a past
+    command is invalid, both are the damped stop, or 0 A.
     """
     if not _believable(law, angle, velocity, past):
         blind = _blind_current(law, velocity)
@@ -96,9 +96,9 @@ def window(law: ShieldLaw, angle: float, velocity: float, past: Past) -> tuple[f
 def _window_and_box(
     law: ShieldLaw, angle: float, velocity: float, past: Past
 ) -> tuple[float, float, float, float, float, float]:
-    """The :func:`window`, and the box of states at the begin of this period if every command was obeyed.
+    """The :func:`window`, and the box of states at the start of this period if every command was obeyed.
 
-    The box is the hull over all ages of a frame. Where the current lags, its velocities are those after what flows has
+    The box is the hull over all ages of a frame. With a lag its velocities are those after the flowing current has
     decayed.
     """
     lowest, highest = -law.current, law.current
@@ -116,7 +116,7 @@ def _window_and_box(
         xl, xh, vl, vh = obeyed
         x0, x1 = xl if xl < x0 else x0, xh if xh > x1 else x1
         v0, v1 = vl if vl < v0 else v0, vh if vh > v1 else v1
-    if lowest > highest:  # cannot happen to a brake of the set; whatever this is, full braking is right for it
+    if lowest > highest:  # cannot happen to a brake of the set: full braking
         lowest = highest = -law.current if velocity > 0.0 else law.current
     if law.delay.lag > 0.0:
         v0, v1 = _decayed(law, v0, v1, past)
@@ -124,7 +124,7 @@ def _window_and_box(
 
 
 def _decayed(law: ShieldLaw, vl: float, vh: float, past: Past) -> tuple[float, float]:
-    """Least and greatest velocity after what flows in a motor whose current lags has decayed."""
+    """Least and greatest velocity after the current that flows in a motor with a lag has decayed."""
     box, delay, flowing = law.box, law.delay, 0.0
     for i in range(PAST - 1, -1, -1):
         flowing = past[i] + delay.kept * (flowing - past[i])
@@ -148,10 +148,10 @@ def braking_window(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float) -
 
 
 def _coasting_window(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float) -> tuple[float, float]:
-    """The window where coasting must do: each end cut at 0 A (L10).
+    """The window of a brake that has to stop by coasting: each end cut at 0 A (L10).
 
-    Up, the energy of motion and of the softest spring must be gone by friction before the apex; down, that of the
-    stiffest spring before the bottom.
+    On the way up friction must dissipate the kinetic energy and that of the softest spring before the apex; on the way
+    down, the kinetic energy and that of the stiffest spring before the bottom.
     """
     ts, box, home = law.sample_time, law.box, law.home
     above = xh + ts * max(vh + law.change, 0.0)
@@ -188,10 +188,10 @@ def _lagging_window(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float, 
 
 
 def _flowing(law: ShieldLaw, past: Past, slowest: float, sign: float) -> float:
-    """Greatest current, times ``sign``, that may flow at the begin of this period [A].
+    """Greatest current, times ``sign``, that may flow at the start of this period [A].
 
-    Each of the last periods had the own command or, where that was lost, the node's damped stop; before, anything. The
-    least velocity now is ``slowest``, times ``sign``, which is −1 for the least current.
+    Each of the last periods had its command or, if that was lost, the node's damped stop; before them any current is
+    possible. The least velocity now is ``slowest``, times ``sign``, which is −1 for the least current.
     """
     flowing = law.current
     for i in range(PAST - 1, -1, -1):
@@ -213,10 +213,10 @@ def _lagging_current(
     motor: float,
     braking: float,
 ) -> float:
-    """Greatest command after which a brake with this motor keeps speed and room in spite of its lag [A].
+    """Greatest command after which a brake with this motor stays within speed and room in spite of its lag [A].
 
-    With ``flowing`` the velocity goes on rising by motor · lag · flowing, until it has fallen to what holds the spring.
-    Against ``room``, full braking acts as if the brake were faster by motor · lag · (flowing + limit).
+    The current ``flowing`` raises the velocity by motor · lag · flowing until it has decayed to the one that holds the
+    spring. For the stop within ``room`` the brake counts as faster by motor · lag · (flowing + limit).
 
     Args:
         law: of the bench.
@@ -237,7 +237,7 @@ def _lagging_current(
     if v < VELOCITY_PAD:
         return -law.current
     over = min(speed - reached, v - stopping) - VELOCITY_PAD
-    # Where the motion may turn around within the sample, friction may help it, viscous friction while it goes back.
+    # If the motion may reverse within the sample, friction may drive it, and so may viscous friction until then.
     helping = box.viscous_high * min(vh - law.change, 0.0) - box.friction_high
     friction = box.friction_low + box.viscous_low * vh if vl > law.change else helping
     return (over / ts + friction + spring) / motor
@@ -251,9 +251,9 @@ def _believable(law: ShieldLaw, angle: float, velocity: float, past: Past) -> bo
 
 
 def _rolled(law: ShieldLaw, angle: float, velocity: float, past: Past, age: int) -> tuple[States, States]:
-    """Boxes of states at the begin of this period, after a measurement of that age.
+    """Boxes of states at the start of this period, after a measurement of that age.
 
-    In the first each of the commands since may have been lost, so that the node has braked; in the second none was.
+    In the first box each command since then may have been lost, so that the node has braked; in the second none was.
     """
     xl = angle - law.angle_noise
     xh = angle + law.angle_noise
@@ -277,9 +277,9 @@ def _rolled(law: ShieldLaw, angle: float, velocity: float, past: Past, age: int)
 def _unseen(
     law: ShieldLaw, xl: float, xh: float, vl: float, vh: float, past: Past, age: int
 ) -> tuple[float, float, float, float]:
-    """Least and greatest change of the velocity that an observer does not show yet, by a measurement of that age.
+    """Least and greatest change of the velocity that an observer does not show yet, for a measurement of that age.
 
-    Twice, as of :func:`_rolled`: where commands may have been lost, and where none was.
+    Two pairs, as in :func:`_rolled`: if commands may have been lost, and if none was.
     """
     ts, change, reach, delay = law.sample_time, law.change, law.reach, law.delay
     shares, before = delay.hidden
@@ -304,11 +304,11 @@ def _accelerated(
 ) -> tuple[float, float, float, float]:
     """Greatest accelerations of any brake of the set in a period, downwards and upwards [rad/s²].
 
-    First where the command may have been lost, so that the node has braked; then where it was obeyed.
+    The first two are for a command that may have been lost, so that the node has braked; the others for one obeyed.
 
     Args:
         law: of the bench.
-        xl: least angle at the begin of the period [rad].
+        xl: least angle at the start of the period [rad].
         xh: greatest angle there [rad].
         slow: least velocity within the period [rad/s].
         fast: greatest velocity within it [rad/s].
@@ -332,7 +332,7 @@ def _accelerated(
     u = u if u < own else own
     strong, weak = motor_high * u, motor_low * u
     down = stiff - (weak if weak < strong else strong)
-    # Friction takes the more, the faster the brake; where it moves the other way, it helps.
+    # Friction grows with the speed; against the direction of the acceleration it adds to it.
     if slow > 0.0:
         taken = viscous_low * slow
         up, obeyed_up = up - friction_low - taken, obeyed_up - friction_low - taken
@@ -349,9 +349,9 @@ def _accelerated(
 
 
 def damped_current(velocity: float, limit: float, damping_velocity: float) -> float:
-    """Damped stop: the current with which a node that gets no command brakes, against the speed up to the limit [A].
+    """Damped stop: current with which a node without a command brakes, against the speed, up to the limit [A].
 
-    It is the limit from ``damping_velocity`` on, which is infinite for a node that only lets go [rad/s].
+    It reaches the limit at ``damping_velocity`` [rad/s], which is infinite for a node that only switches off.
     """
     u = -limit * velocity / damping_velocity
     u = -limit if -limit > u else u
@@ -397,7 +397,7 @@ def fastest_next(law: ShieldLaw, vl: float, vh: float, drive: float) -> float:
     """Greatest velocity one sample after [vl, vh], where ``drive`` bounds motor and spring [rad/s²].
 
     Euler's map is monotone on either side of zero and jumps at it, so the two corners and the jump bound it. A brake
-    that would come to rest may stick: hence not below zero from above.
+    that would come to rest may stick: so the bound for a positive velocity is at least 0.
     """
     ts, box = law.sample_time, law.box
     if vh <= 0.0:
@@ -414,8 +414,7 @@ def _highest_current(law: ShieldLaw, vl: float, vh: float, v: float, spring: flo
     """Greatest current after which no brake is faster than ``v``; full braking where that is negative [A].
 
     The inverse of :func:`fastest_next` for velocities within ``vl`` and ``vh``; for the lower limits it is called in
-    mirrored velocities. ``spring`` is what the clamping force takes from the motion, at least [rad/s²]; negative where
-    it drives it.
+    mirrored velocities. ``spring`` is the least deceleration by the clamping force [rad/s²]; negative if it drives.
     """
     ts, box = law.sample_time, law.box
     if v < 0.0:
@@ -432,7 +431,7 @@ def _highest_current(law: ShieldLaw, vl: float, vh: float, v: float, spring: flo
 
 
 def _blind_current(law: ShieldLaw, velocity: float) -> float:
-    """The damped stop against a believable velocity, 0 A without one."""
+    """The damped stop for a valid velocity, else 0 A."""
     return damped_current(velocity, law.current, law.damping_velocity) if abs(velocity) <= BELIEVABLE else 0.0
 
 
@@ -480,7 +479,7 @@ def _arrival(law: ShieldLaw, x: float, v: float) -> float:
 
 
 def _climbing_down(law: ShieldLaw, x: float) -> float:
-    """Time that a brake that must be able to coast loses where it may not be as fast as at the origin [s].
+    """Additional time of a coasting brake where its speed limit is below that at the origin [s].
 
     The speed limit is a concave function of the angle, so that the trapezoids lie above the integral.
     """
@@ -503,11 +502,11 @@ def _return_current(law: ShieldLaw, x: float, v: float, left: float) -> float:
     motor = 0.5 * (box.motor_low + box.motor_high)
     zone = home.settled_zone if left < home.settling else home.rest_zone
     if abs(x) < zone:
-        # Friction stops what it can in the time that is left; of more than that, what is certain is braked.
+        # Speeds that friction stops in the remaining time need no current; of faster ones the certain part is braked.
         in_time = home.rest_velocity - 2.0 * law.velocity_noise + box.friction_low * left
         if abs(v) < min(home.rest_velocity, max(law.velocity_noise, in_time)):
             return 0.0
-        # The noise is left out: what chatters between the signs of a standing brake is not braked into moving.
+        # Less the noise: else the noise of a brake at rest would become a current that moves it.
         excess = v - law.velocity_noise if v > 0.0 else v + law.velocity_noise
         return -home.gain * excess / (law.sample_time * motor)
     direction = -1.0 if x > 0.0 else 1.0

@@ -436,6 +436,6 @@ def _margin(law: ShieldLaw) -> tuple[float, str]:
         return needed, "a brake that coasts in samples"
     motors = (box.motor_low, box.motor_high)[: 2 if law.delay.lag > 0.0 else 1]
     stops = [damped_excess(m, box.friction_low, law.current, law.damping_velocity, ts) for m in motors]
-    # The node brakes against the velocity at the begin of a period, and a current that still flows raises it.
+    # The node brakes against the velocity at the start of a period, and a current that still flows raises it.
     held = [ts * law.delay.lag * m * law.current for m in motors]
     return needed + max(a + b for a, b in zip(stops, held, strict=True)), "the damped stop"

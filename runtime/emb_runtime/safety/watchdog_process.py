@@ -1,18 +1,20 @@
-"""The watchdog process: sends the stop frame when the loop stands still or is gone, and can send nothing else.
+"""The watchdog process: sends the stop frame when the loop stalls or has ended, and can send no other frame.
 
-``python -m emb_runtime.safety.watchdog_process HEARTBEAT_FD [LOOP_SOCKET_FD] DOCUMENT_FD``, started by
-:class:`emb_runtime.safety.watchdog.WatchdogHandle` and by nobody else. It has another socket of the bus, a priority
-above the loop's, and 225 frames made beforehand: disabled, 0 A, one for each pair of counters. What is in the shared
-memory chooses among them and cannot make another.
+``python -m emb_runtime.safety.watchdog_process HEARTBEAT_FD [LOOP_SOCKET_FD] DOCUMENT_FD``, started only by
+:class:`emb_runtime.safety.watchdog.WatchdogHandle`. It has another socket of the bus, a priority above the loop's, and
+225 prepared frames: disabled, 0 A, one for each pair of counters. The shared memory only selects one of them.
 
-Why no enabled command acts after the trip. ``tripped`` is set before the first stop frame leaves, and the guard asks
-for it before each command. One command may be past that question: its loop was stopped between asking and sending. It
-answers a sample from before the silence, and the node obeys an answer to its newest sample only; and the node's stop,
-which the first stop frame began, is latched. Where the node stood still as well, the stop frames of the next two
-periods come after that command. What waits in the interface's queue leaves before the stop frames, which queue up
-behind it. For a loop that goes on much later, its counters may fit once more by chance: so on SocketCAN the watchdog,
-after its first stop frame, also binds the loop's socket to no interface. From then on the kernel refuses whatever the
-loop sends; it still hears, and every CAN interface now.
+Why no enabled command acts after the trip:
+
+* ``tripped`` is set before the first stop frame is sent, and the guard reads it before each command.
+* One command may have passed this check, if the loop was stopped between check and sending. It answers a sample from
+  before the silence, and the node obeys only an answer to its newest sample. The node's stop, which the first stop
+  frame began, is latched, too. If the node also stood still, the stop frames of the next two periods follow that
+  command.
+* Frames in the queue of the interface are sent before the stop frames, which wait behind them.
+* If the loop continues much later, its counters may match by chance. So on SocketCAN the watchdog, after its first stop
+  frame, binds the loop's socket to no interface. The kernel then rejects every frame that the loop sends; the socket
+  still receives, from all CAN interfaces.
 """
 
 from __future__ import annotations
@@ -37,10 +39,10 @@ from emb_runtime.safety.heartbeat import STOP_FRAMES, Heartbeat
 from emb_runtime.system import child_process, realtime
 from emb_runtime.system.clock import Clock
 
-PRIORITY = realtime.PRIORITY + 10  # Above the loop's, which may hog the only processor
+PRIORITY = realtime.PRIORITY + 10  # Above the loop's, which may occupy the only processor
 LOOKS = 5  # Looks at the heartbeat within its time
-LONGEST_SILENCE = 2  # Heartbeats after which a silence is one too many, whoever's time was stolen
-STOP_TRIES = 50  # Periods in which a stop frame is tried until so many were sent: the transmit queue may be full
+LONGEST_SILENCE = 2  # Longest silence, in heartbeats, even if this process was delayed
+STOP_TRIES = 50  # Most periods in which stop frames are tried: the transmit queue may be full
 REST_NS = 100_000_000  # Time between two looks after the stop frames, until the loop's process ends [ns]
 
 StopFrames = tuple[tuple[Frame, ...], ...]
@@ -53,11 +55,11 @@ class LoopStatus(StrEnum):
     ALIVE = ""
     STALLED = "stalled"  # The loop is silent for too long: send the stop frames
     GONE = "gone"  # The loop's process has ended while it was to be watched: send the stop frames
-    OVER = "over"  # The loop's process has ended, or has let go of the watchdog, and all was over
+    OVER = "over"  # The loop's process has ended, or has released the watchdog, after its run
 
 
 class SilenceMonitor:
-    """Judges the loop's silence. Pure: monotonic times are handed in [ns].
+    """Monitor of the loop's silence. Pure: monotonic times are handed in [ns].
 
     A silence as long as the heartbeat trips. If this process itself was delayed by more than two polls, the excess is
     not counted as loop silence, up to two heartbeats in all: that is the longest silence, plus the time of one poll.
@@ -72,10 +74,10 @@ class SilenceMonitor:
         self._stolen_ns = 0
 
     def look(self, now_ns: int, beat_ns: int, armed: bool, gone: bool) -> LoopStatus:
-        """Look once at a monotonic time, which is read after the loop's last sign of life, ``beat_ns`` [ns].
+        """Evaluate the heartbeat at a monotonic time, which is read after the loop's last beat, ``beat_ns`` [ns].
 
-        One from the future is none: the memory is damaged. ``armed``: the loop is to be watched; ``gone``: it has
-        ended.
+        A beat in the future means that the memory is damaged, and counts as a stall. ``armed``: the loop is to be
+        watched; ``gone``: it has ended.
         """
         gap_ns, self._look_ns = now_ns - self._look_ns, now_ns
         if gone:
@@ -105,24 +107,24 @@ def stop_frames(layout: Layout) -> StopFrames:
 
 @dataclass
 class Watchdog:
-    """The watch over one loop, from the first look to the end of its process."""
+    """Watchdog of one loop, from the first look to the end of its process."""
 
     heartbeat: Heartbeat
     frames: StopFrames
     period_ns: int  # Between two stop frames [ns]
     clock: Clock
-    send: Callable[[Frame], None]  # Puts a frame on the bus; raises BusError, or whatever a vendor's driver does
+    send: Callable[[Frame], None]  # Puts a frame on the bus; raises BusError, or any error of a vendor's driver
     silence_loop: Callable[[], None]  # Takes the bus away from the loop's socket; raises OSError
-    wait: Callable[[int], bool]  # Waits until a time or until the loop's process is gone, and gives whether it is
+    wait: Callable[[int], bool]  # Waits until a time or until the loop's process ends; True if it has ended
     tripped: str = ""
     time_ns: int = 0  # Time of the last look [ns]
-    beat_ns: int = 0  # The loop's last sign of life then [ns]
+    beat_ns: int = 0  # The loop's last beat at that look [ns]
     sent: int = 0
     lateness_ns: int = 0  # Largest lateness of a look [ns]
     error: str = ""
 
     def run(self) -> dict[str, Any]:
-        """Watch until there is nothing to watch any more; returns what happened, see ``WatchdogResult``."""
+        """Watch until the loop's process has ended; returns the fields of ``WatchdogResult``."""
         status = self._watch()
         if status is not LoopStatus.OVER:
             self._stop(status)
@@ -163,9 +165,9 @@ class Watchdog:
             try:
                 self.send(self.frames[counter][answers])
                 self.sent += 1
-            except Exception as err:  # whatever is broken, the next one is still tried
+            except Exception as err:  # of any kind: the next frame is still tried
                 self.error = str(err) or type(err).__name__
-            if attempt == 0:  # after the stop frame, for it may have to wait for the kernel
+            if attempt == 0:  # after the stop frame, as it may block in the kernel
                 try:
                     self.silence_loop()
                 except OSError as err:
@@ -177,13 +179,13 @@ class Watchdog:
 
 
 def _loop_is_gone(parent: int, clock: Clock) -> Callable[[int], bool]:
-    """A wait that ends at once when the parent lets go of our standard input, or ends in whatever way."""
+    """A wait that returns at once when the parent closes our standard input or ends."""
     watched = [0, os.pidfd_open(parent)]  # a process that the runtime forked may hold the other end of the pipe open
     if os.getppid() != parent:
         raise ProcessLookupError("the runtime has ended")
 
     def wait(until_ns: int) -> bool:
-        # Nothing is ever written into the pipe: readable is its end.
+        # Nothing is written into the pipe: readable means end of file.
         return bool(select.select(watched, [], [], max(0.0, (until_ns - clock.now_ns()) * 1e-9))[0])
 
     return wait

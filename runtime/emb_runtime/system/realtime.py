@@ -1,8 +1,8 @@
-"""Real-time settings of this process: each best effort, and what was *obtained* is returned for the log.
+"""Real-time settings of this process: each is best effort, and the *obtained* ones are returned for the log.
 
-One thread and no garbage collector in the loop; SCHED_FIFO is what protects the tail of the wake-up latency under
-load, the default 50 µs timer slack is what costs the median without it. On an idle computer most of a cycle's time
-goes into processors that were allowed to sleep, so none is, until this process ends.
+The loop has one thread and no garbage collector. SCHED_FIFO limits the longest wake-up latency under load; without load
+the default timer slack of 50 µs determines the median. On an idle computer most of a cycle's time is the wake-up from
+sleep states, so the processors are kept awake until this process ends.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ PRIORITY = 80  # Scheduling priority of the loop
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _PR_SET_TIMERSLACK, _PR_SET_THP_DISABLE = 29, 41
 WAKE_UP_LATENCY = "/dev/cpu_dma_latency"
-"""Device that takes the longest wake-up from an idle state that is allowed [µs], as long as it is open."""
+"""Device that limits the wake-up latency of idle states [µs] while it is open."""
 _awake: int | None = None  # Its descriptor
 
 
@@ -33,7 +33,7 @@ def obtain(priority: int = PRIORITY) -> dict[str, str]:
     return {
         "garbage_collector": "frozen, off",
         "timer_slack": _set(_PR_SET_TIMERSLACK, "1 ns"),
-        # The kernel joins small pages to huge ones at ordinary priority; whoever touches one meanwhile waits for it.
+        # The kernel merges pages to huge ones at ordinary priority; an access to one of them waits meanwhile.
         "huge_pages": _set(_PR_SET_THP_DISABLE, "none are made"),
         "idle_states": _stay_awake(),
         "memory_lock": _lock_memory(),
@@ -69,7 +69,7 @@ def _stay_awake() -> str:
 
 def _set(option: int, obtained: str) -> str:
     """Set a switch of this process to 1: prctl(2)."""
-    # As long as the kernel reads them: where an argument that must be zero is not, it refuses.
+    # Arguments of the length that the kernel reads: it refuses an unused one that is not zero.
     return _called("prctl", option, *map(ctypes.c_ulong, (1, 0, 0, 0)), obtained=obtained)
 
 

@@ -187,7 +187,7 @@ def test_a_velocity_that_lags_more_than_is_declared_ends_it(sheet: Bench) -> Non
         require_none(Velocity().problems(declared))
     for declared, words in (
         (Sensors(), "a sensor's"),
-        (Sensors("observer", 1600.0), "an observer's, of at least 1600"),
+        (Sensors("observer", 1600.0), "an observer's, with a bandwidth of at least 1600"),
     ):
         with pytest.raises(EmbError, match=rf'declares {words}.* velocity = "observer" and observer_bandwidth = 1410'):
             require_none(observed.problems(declared))
@@ -298,7 +298,7 @@ def test_the_file_declares_the_velocity_as_it_was_measured() -> None:
             bench = parse_bench(text, "found")
             assert bench.sensors == velocity.sensors
             assert bench.plants[MEASURED].instruments.observer_bandwidth == velocity.bandwidth
-            assert f"# by {LOGS} it is {velocity}\n" in text
+            assert f"# measured with {LOGS}: {velocity}\n" in text
 
 
 def test_a_data_sheet_without_any_shield_is_refused_with_the_reason() -> None:

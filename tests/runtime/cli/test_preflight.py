@@ -209,7 +209,7 @@ def test_what_only_warns_stands_in_its_line_alone(findings: Findings) -> None:
 def test_a_declared_observer_of_the_velocity_is_named(findings: Findings) -> None:
     assert "observer" not in checks_of(planned(findings, bench=SENSOR_BENCH))["shield"].found
     for sensors, said in (
-        (Sensors("observer", 1520.0), "of at least 1520 rad/s"),
+        (Sensors("observer", 1520.0), "with a bandwidth of at least 1520 rad/s"),
         (Sensors("observer", velocity_lag=1e-3), "1 ms late at most"),
     ):
         line = checks_of(planned(findings, bench=replace(findings.plan.bench, sensors=sensors)))["shield"]
