@@ -44,21 +44,21 @@ def parser() -> argparse.ArgumentParser:
         "source",
         metavar="EXCITATION|CSV|ONNX",
         help="a sequence: step:amplitude=1.5, chirp:f1=20, ..., the .csv file of emb-design, or your own with the "
-        "columns current, or time,current; your network as .onnx: one number for angle, velocity and time, or for "
-        "these and the running estimate",
+        "columns current, or time,current; your network as .onnx: its inputs are angle, velocity and time, with or "
+        "without the running estimate; its output is one number",
     )
     p.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the ONNX file")
     p.add_argument(
         "--kind",
         choices=tuple(UNITS),
-        help="what your network gives: a current [A], or a target speed [rad/s] which the runtime's speed loop follows "
+        help="output of your network: a current [A], or a target speed [rad/s] which the runtime's speed loop follows "
         "(default: current)",
     )
     p.add_argument(
         "--bench",
         type=Path,
         metavar="FILE",
-        help="bench that it is for (default: the shipped drum brake)",
+        help="bench file of the policy's bench (default: the shipped drum brake)",
     )
     return p
 

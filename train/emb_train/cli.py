@@ -55,7 +55,7 @@ example:
 
 POLICY: the folder of a training, its plan.json, an ONNX file, or 'actor' for the shipped one
 
-criteria: T adds -2 ln of the interval between runs of each parameter that an estimate will have, as emb-replay fim
+criteria: T adds -2 ln of the between-run interval of each parameter that an estimate will have, as emb-replay fim
 expects it, and I of its repeatability; D, A and E are those of the physical information of ideal sensors with the
 prior of +-50 %; 'weighted' is the smallest eigenvalue of the thesis's weighted information. All are relative to the
 true parameters.

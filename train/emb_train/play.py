@@ -210,7 +210,7 @@ MEASURES: Mapping[str, Measure] = MappingProxyType(
     {
         m.name: m
         for m in (
-            Measure("T", "T (sum of -2 ln of the interval between runs)", _T, "physical", 0.0, "difference"),
+            Measure("T", "T (sum of -2 ln of the between-run interval)", _T, "physical", 0.0, "difference"),
             Measure("I", "I (sum of -2 ln of the repeatability)", _I, "physical", 0.0, "difference"),
             Measure("D", "ln det(M + 12 I)", Criterion("D"), "physical", PRIOR, "difference"),
             Measure("A", "-ln tr (M + 12 I)^-1", Criterion("A"), "physical", PRIOR, "log-ratio"),

@@ -21,7 +21,7 @@ from emb_runtime.estimator.estimate import NORMAL_95
 
 Names = str | Sequence[str]
 """Names, or one text with commas between them."""
-MAP = "map file of a recording of others: which column of it is what, and what is known of the machine"
+MAP = "map file of a recording of others: meaning of its columns, known parameters of the machine"
 NUMBER = r"(?:[0-9]+[.]?[0-9]*|[.][0-9]+)(?:[eE][-+]?[0-9]+)?"  # Without a sign
 
 
@@ -38,13 +38,16 @@ class QuestionOptions(Options):
         None, "further unknowns (default: none; of a recording those that its map names)", "NAMES"
     )
     model: str | None = option(
-        None, "plant of the bench (default: the one that was simulated; exact where a log does not say)", "MODEL"
+        None, "plant of the bench (default: the simulated plant that the log names, otherwise exact)", "MODEL"
     )
     prior: str | None = option(
         None, "name of ranges in the bench file in which the parameters are known to lie (default: none)", "PRIOR"
     )
     bench: str | Path | None = option(
-        None, "bench file (default: the one in the log; of several logs in one estimate the first)", "FILE", kind=Path
+        None,
+        "bench file (default: that of the log; for several logs in one estimate, that of the first)",
+        "FILE",
+        kind=Path,
     )
 
     def __post_init__(self) -> None:
@@ -84,8 +87,8 @@ class FitOptions(SearchOptions):
     method: str | None = option(None, "see above (default: oem; windows for a recording)", choices=tuple(METHODS))
     model: str | None = option(
         None,
-        "plant of the bench to estimate with, or 'all': each is fitted, and the best is used (default: the one that "
-        "was simulated; exact where a log does not say)",
+        "plant of the bench to estimate with, or 'all': each is fitted, and the best is used (default: the simulated "
+        "plant that the log names, otherwise exact)",
         "MODEL",
     )
     systematic: str = option(
@@ -96,12 +99,12 @@ class FitOptions(SearchOptions):
     )
     known: Names | None = option(
         None,
-        "parameters that were measured otherwise, such as k_m=0.0217±0.1%; J is then estimated (default: none, or k_m "
-        "where [systematic] of the bench file says how well it is known)",
+        "parameters from a separate measurement, such as k_m=0.0217±0.1%; J is then estimated (default: none, or k_m "
+        "if [systematic] of the bench file has its error)",
         "NAME=VALUE±HALF",
     )
     window: float = option(
-        0.0, "length of the windows [s], with method windows (default: what the map says, or 0.5)", "X", kind=float
+        0.0, "length of the windows [s], with method windows (default: that of the map, or 0.5)", "X", kind=float
     )
     map: str | Path | None = option(None, MAP, "FILE", kind=Path)
 
@@ -137,9 +140,9 @@ class FitOptions(SearchOptions):
 class EstimateOptions(FitOptions):
     """Options of an estimate."""
 
-    profile: bool = option(False, "likelihood profiles of all parameters (default: of those that are identified badly)")
+    profile: bool = option(False, "likelihood profiles of all parameters (default: of weakly identified ones)")
     last: str | Path | None = option(
-        None, "JSON of an earlier estimate or report, to say what has changed since", "FILE", kind=Path
+        None, "JSON of an earlier estimate or report, to report significant changes since then", "FILE", kind=Path
     )
 
 

@@ -322,7 +322,7 @@ class Code(StrEnum):
     ACCEPTED = "accepted"
     NO_ESTIMATE = "no estimate"
     APART = "each run fits alone"
-    BIASED_METHOD = "not judged by a method that is biased"
+    BIASED_METHOD = "no verdict, as the method is biased"
     DOES_NOT_FIT = "DOES NOT FIT"
     DOES_NOT_PREDICT = "DOES NOT PREDICT"
     NOT_IDENTIFIED = "not all parameters are identified"

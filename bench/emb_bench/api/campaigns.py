@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def campaign(
     paths: str | Path | Sequence[str | Path], output: str | Path, options: CampaignOptions | None = None, **more: Any
 ) -> Campaign:
-    """Many logs in parallel: one row each in a Parquet or CSV file, and what they say together.
+    """Many logs in parallel: one row each in a Parquet or CSV file, and a summary.
 
     A row has the identity of the run, its Fisher information at the bench's nominal brake, and an estimate of the
     parameters. A log that cannot be evaluated becomes a row with the reason. The rows do not depend on the number of

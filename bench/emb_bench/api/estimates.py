@@ -59,7 +59,7 @@ def estimate(runs: AnyRun | Sequence[AnyRun] = (), options: EstimateOptions | No
 def report(
     runs: AnyRun | Sequence[AnyRun], output: str | Path, options: ReportOptions | None = None, **more: Any
 ) -> Report:
-    """One page about runs of one brake, to hand over, and a JSON file beside it.
+    """Report page on runs of one brake, and a JSON file beside it.
 
     The verdict comes first, then the evidence. The page is one file for screen and paper. An unusable log is named and
     skipped. A run without an experiment is reported without an estimate. With ``compare`` two runs stand side by side,

@@ -177,8 +177,8 @@ def export(run: AnyRun, output: str | Path, options: ExportOptions | None = None
 def rerun(run: AnyRun) -> Rerun:
     """Run the loop again from the log of a run, and compare what it decides.
 
-    The core of the control loop runs again with the policy, bench file and DBC of the log. What went into it goes in
-    again: the frames of each read, and the calls in ``/input``. Each decision (policy, clip, shield, sent current, its
+    The core of the control loop runs again with the policy, bench file and DBC of the log. It gets the recorded inputs:
+    the frames of each read, and the calls in ``/input``. Each decision (policy, clip, shield, sent current, its
     reason), each estimate, each sent frame, each safety event with its time and text, and the outcome must be the same,
     numbers to the last bit. A cut log is compared up to its end. Rounding may differ with another ONNX Runtime, numpy,
     Python or processor. If a decision differs, the versions of the log are printed too.
@@ -215,11 +215,11 @@ def info(run: AnyRun) -> dict[str, Any]:
 
 
 def timing(runs: AnyRun | Sequence[AnyRun]) -> list[RunTiming]:
-    """Timing of runs, judged by the budgets of their bench.
+    """Timing of runs, compared with the budgets of their bench.
 
     How long each part of a control cycle took, by the time stamps in the log: sample to sample, sample to loop,
     decision, sending, sensor to command, and the time remaining before the answer would have been late. The times are
-    compared with [budgets] of the bench file in the log. Simulated time is not judged.
+    compared with [budgets] of the bench file in the log. Simulated time gets no verdict.
 
     Args:
         runs: MCAP files of emb-run.

@@ -40,7 +40,7 @@ class CampaignOptions(SearchOptions):
     method: str = option("oem", "see above, or 'none' for information alone (default: oem)", choices=(NONE, *METHODS))
     jobs: int | None = option(None, "logs at a time (default: one for each processor)", "N", kind=int, least=1)
     time_limit: float = option(
-        600.0, "longest time for one log [s]; one that takes longer has failed (default: 600)", "X", kind=float
+        600.0, "longest time for one log [s]; a log that takes longer fails (default: 600)", "X", kind=float
     )
     ray: str | None = option(
         None,
@@ -129,7 +129,7 @@ COLUMNS = {
     "log_det": Column("number", "log det of the physical Fisher information, relative parameters", "1"),
     "lambda_min": Column("number", "its smallest eigenvalue", "1"),
     "trace_inverse": Column("number", "trace of its inverse", "1"),
-    "T": Column("number", "interval between runs that is expected of an estimate: sum of -2 ln of it", "1"),
+    "T": Column("number", "between-run interval expected of an estimate: sum of -2 ln of it", "1"),
     "I": Column("number", "the same of the repeatability", "1"),
     "fits": Column("truth", "the model with the estimated parameters explains the record; null without an estimate"),
     "chi2_per_freedom": Column("number", "chi2/n of the residuals at the estimate", "1"),

@@ -50,7 +50,7 @@ PARAMETERS: Mapping[str, Parameter] = {
     "offset": Parameter(
         "rad",
         False,
-        "what the encoder shows at the origin [rad], of each log",
+        "reading of the encoder at the origin [rad], of each log",
         of_an_experiment=True,
         effect="an encoder offset",
         remedy="home the encoder, or --nuisance offset,x1_0",
@@ -94,7 +94,7 @@ PARAMETERS: Mapping[str, Parameter] = {
     "current_offset": Parameter(
         "A",
         False,
-        "current that acts beyond what the node reports [A]",
+        "acting current less the reported one [A]",
         effect="an offset of the current",
         remedy="calibrate it, or --nuisance current_offset",
     ),
@@ -154,7 +154,7 @@ PARAMETERS: Mapping[str, Parameter] = {
     ),
     "play": Parameter(
         "rad",
-        about="travel of the motor after a turn until the clamp follows [rad]; not together with hysteresis",
+        about="travel of the motor after a reversal until the clamp follows [rad]; not together with hysteresis",
         low=1e-4,
         high=10.0,
         start=0.1,

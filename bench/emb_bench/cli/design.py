@@ -17,9 +17,9 @@ A design is for known parameters: it shows how good an excitation can be. Do not
 a brake with other parameters, which would leave its limits. The result is the best of many
 local optima.
 
-criteria: T, the interval of an estimate between runs; I, its repeatability; or a
-parameter, for its share in T: sums of -2 ln of relative deviations, as emb-replay fim
-expects them. Of ideal sensors: D log det M, A tr M^-1, E smallest eigenvalue.
+criteria: T and I are sums of -2 ln of the relative deviations that emb-replay fim expects
+of an estimate, T between runs, I by repeatability; the name of a parameter is its part of
+T. For ideal sensors: D log det M, A tr M^-1, E smallest eigenvalue.
 
 example:
   emb-design -o design.csv

@@ -25,10 +25,10 @@ class LiveOptions(Options):
 
 
 def live(place: Path, options: LiveOptions) -> None:
-    """Show runs while they go on: on a page in the browser, or in Foxglove.
+    """Show runs in progress: on a page in the browser, or in Foxglove.
 
-    Show the newest log of a folder and those that appear, while they are written: on a page in the browser, which
-    lists the others, and in Foxglove and Lichtblick over the Foxglove WebSocket protocol (open the address as a
+    Show the newest log of a folder, and each log that is written there later: on a page in the browser, which also
+    lists all logs, and in Foxglove and Lichtblick over the Foxglove WebSocket protocol (open the address as a
     connection, with the layout of the documentation). The command only reads files and does not affect a run. Ctrl-C
     ends it. emb-run --live shows one run.
 

@@ -51,8 +51,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--brake", default="", metavar="plant=stribeck,f_v=3e-5,...",
         help="as for `emb-run --iface sim:`: one of the bench's plants, true parameters (default: nominal), seed (1), "
-        "angle_noise, velocity_noise (the bench file's), charge=1: send the integral of the current along, "
-        "temperature [degC] with supply_voltage [V]: send them along",
+        "angle_noise, velocity_noise (the bench file's), charge=1: also send the integral of the current, "
+        "temperature [degC] with supply_voltage [V]: also send them",
     )  # fmt: skip
     p.add_argument("--duration", type=float, metavar="S", help="seconds to run (default: until stopped)")
     p.add_argument("--no-rt", action="store_true", help="leave scheduling and memory alone")

@@ -39,7 +39,7 @@ METHODS = """\
 
 methods:
   oem      output error: simulated angle and velocity nearest to the measured ones
-  pem      prediction error: a Kalman filter, for brakes that are disturbed
+  pem      prediction error: a Kalman filter, for brakes with disturbances
   rls      recursive least squares: simple and biased, as a baseline
   windows  output error over windows, for machines without a spring
 """

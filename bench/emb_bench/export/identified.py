@@ -45,7 +45,7 @@ ABOUT: Mapping[str, str] = {
     "hysteresis": "share by which the clamping force is larger while tightening, smaller while releasing",
     "hysteresis_travel": "angle from the middle of the hysteresis to one side",
     "current_lag": "time constant of the current; 0: none",
-    "play": "travel of the motor after a turn until the clamp follows; not together with hysteresis",
+    "play": "travel of the motor after a reversal until the clamp follows; not together with hysteresis",
     "viscous_asymmetry": "share by which f_v is larger in the positive direction, smaller in the negative",
     "tolerance": "local error of the velocity per step",
     "contact": "angle at which the clamping begins",

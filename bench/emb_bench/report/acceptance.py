@@ -195,7 +195,7 @@ def _completed(run: StudiedRun, several: bool) -> Criterion:
 def _model_fit(study: Study, doubt: str) -> Criterion:
     name, required = "model fit", "residuals are noise"
     if verdict(study).model in (Code.NO_ESTIMATE, Code.BIASED_METHOD):
-        return Criterion(name, required, "not judged", Result.CANNOT_TELL, doubt)
+        return Criterion(name, required, "no verdict", Result.CANNOT_TELL, doubt)
     found = f"chi2/n {plain(study.estimate.validation.ratio)}"
     return Criterion(name, required, found, Result.FAIL if doubt else Result.PASS, doubt)
 

@@ -39,7 +39,7 @@ def _half(deviation: float, name: str) -> str:
 
 
 def _verdict(check: Check) -> str:
-    return f"{'limits held' if check.limits_held else 'LIMITS LEFT'}, {'home' if check.home else 'not home'}"
+    return f"{'limits kept' if check.limits_held else 'LIMITS LEFT'}, {'home' if check.home else 'not home'}"
 
 
 def _checks(report: Report) -> Table:

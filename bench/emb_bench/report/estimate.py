@@ -22,7 +22,7 @@ from emb_bench.report.information import directions, doubts, trade_offs
 from emb_bench.report.text import Table, facts, listed, wrapped
 from emb_runtime.numbers import plain
 
-SCALE = "below that: docs/howto/below-two-percent.md"  # If J limits an interval
+SCALE = "to improve: docs/howto/below-two-percent.md"  # If J limits an interval
 NOTICED = 2.0  # Score above which an effect without an alarm is named [standard deviations]
 
 

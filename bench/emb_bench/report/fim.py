@@ -102,7 +102,7 @@ def fim_text(e: Evaluation, *, verbose: bool = False) -> str:
     """Defects of the log, then the smallest possible repeatabilities; with ``verbose`` the criteria over time."""
     doubts, lines = [*listed("WARNING: ", say.warnings(e)), *listed("NOTE: ", say.notes(e))], _heading(e)
     velocity = "" if e.fit.velocity is None else f", velocity {plain(e.fit.velocity)}"
-    fit = f"rms: angle {plain(e.fit.angle)}{velocity} sigma (at most {e.fit.expected:.2f} if it fits)"
+    fit = f"rms: angle {plain(e.fit.angle)}{velocity} sigma (at most {e.fit.expected:.2f} if the model fits)"
     lines += [*facts(("model", f"{e.plant.name} ({_why(e)})"), ("residuals", fit)), *_unknowns(e.question)]
     if not e.fisher("weighted").matrix.any():  # which has no prior
         return "\n".join([*doubts, "no information: the record does not depend on any of these parameters", *lines])
@@ -135,8 +135,8 @@ def _expected(e: Evaluation, prior: str) -> list[str]:
         kinds = (interval.repeatability, interval.between_runs, interval.total)
         halves = [_half(float(kind[i]), shown.unit if name in UNITS else "") for kind in kinds]
         rows.append([shown.name, *halves, "" if most is None else shown_as(most, machine).name])
-    header = ("", "repeatability", "between runs", "total", "most between runs by")
-    title = f"possible for emb-replay estimate, ± 95 % (k=2){prior}"
+    header = ("", "repeatability", "between runs", "total", "largest between runs")
+    title = f"expected from emb-replay estimate, ± 95 % (k=2){prior}"
     return [title, *Table("", header, rows, words=(0, 4)).lines("  "), ""]
 
 

@@ -144,7 +144,7 @@ def notes(e: Evaluation) -> list[str]:
         values = ", ".join(f"{n} = {plain(v)} {UNITS[n]}".removesuffix(" 1") for n, v in given.items())
         found.append(f"systematic errors of this record are fixed at those of {e.theta_name}: {values}")
     if instruments.observer_bandwidth > 0.0:
-        found.append("the velocity is an observer's and adds no physical information")
+        found.append("the velocity comes from an observer and adds no physical information")
     if instruments.clock_jitter > 0.0:
         found.append(
             "a sigma includes the motion during the clock's jitter; angle and velocity of a sample count as "

@@ -154,7 +154,7 @@ def page_of(report: Report) -> Page:
         evidence=[
             *(_evidence(study) if shown else ()),
             *_runs_in_full(report, motions, drawn),
-            Section("words", "What the words mean", _words(study if shown else None), 3, folded=True),
+            Section("words", "Terms", _words(study if shown else None), 3, folded=True),
         ],
         footer=f"Made by {report.made_by} from {', '.join(names)}. The JSON file beside this page has the same "
         "numbers. Copy this page only in full.",
@@ -212,7 +212,7 @@ def _summary(report: Report, found: Verdict, *, shown: bool) -> Iterator[Block |
 
 
 def _not_judged(study: Study) -> Words:
-    return [Cell(f"not judged: {study.why_not or 'the experiment was cut short'}", "care")]
+    return [Cell(f"no verdict: {study.why_not or 'the experiment was cut short'}", "care")]
 
 
 def _model(study: Study, found: Verdict) -> Iterator[Block]:
@@ -358,11 +358,11 @@ def _evidence(study: Study) -> Iterator[Section]:
     blocks: list[Block | None] = [correlation, _care(say.pairs(pairs) if pairs else "")]
     if checks.profiles:
         labels = ", ".join(p.label for p in checks.profiles)
-        shows = f"Rise of chi-squared over {labels}, beside the parabola of the Fisher information"
+        shows = f"Increase of chi-squared with {labels}, beside the parabola of the Fisher information"
         caption = (
-            "Rise of chi2 over one unknown, relative to its estimate; the others are fitted again. Pale: the parabola "
-            "of the Fisher information. Values below the dashed line are in the 95 % interval of a right model. The "
-            "intervals above also hold what the model may lack."
+            "Increase of chi2 with one parameter fixed, relative to its estimate; all others are fitted again. Pale: "
+            "the parabola of the Fisher information. Values below the dashed line are in the 95 % interval of a right "
+            "model. The intervals above also include effects that the model may lack."
         )
         panel = Panel(figures.profiles(checks.profiles, e), shows)
         blocks += [Figures([panel], caption, wide=True)]
@@ -492,7 +492,7 @@ def _events(motion: Motion) -> Table:
         [signed(1e-6 * (event.time_ns - begin), "+.3f"), event.code[:LONGEST], event.text[:LONGEST]]
         for event in events[:EVENTS]
     ]
-    zero = "the experiment's begin" if active else "the first event"
+    zero = "the start of the experiment" if active else "the first event"
     return Table(f"Events of the safety chain, since {zero}", ["time [ms]", "event", "what"], rows, words=(1, 2))
 
 

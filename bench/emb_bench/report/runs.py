@@ -133,7 +133,7 @@ def timing_text(entry: RunTiming, *, verbose: bool = False) -> str:
     """Verdict on the budgets of a run, and its intervals; with ``verbose`` all budgets."""
     t, missed = entry.timing, [check for check in entry.checks if not check.met]
     if entry.why_not:
-        verdict = f"not judged: {entry.why_not}"
+        verdict = f"no verdict: {entry.why_not}"
     elif missed:
         verdict = f"NOT MET: {len(missed)} of {len(entry.checks)} budgets ({', '.join(one.name for one in missed)})"
     else:

@@ -251,7 +251,7 @@ def alarms(e: Estimate) -> list[str]:
     elif m.cause is not None:
         found.append(_cause(m.cause, e))
     elif scored:
-        found.append("no effect explains it in an amount that is possible: look for a fault in the data")
+        found.append("no effect explains the misfit with a possible amount: look for a fault in the data")
     elif m.together is not None and "scores" in m.alarming:
         score = f"chi2 {plain(m.together.statistic, 4)} of {m.together.rank}, {p_value(m.together.p_value)}"
         found.append(f"the model lacks several effects together ({score})")
@@ -370,7 +370,7 @@ def explained(cause: Cause, machine: Machine | None = None) -> str:
     if cause.share is None:
         does = "is the most significant"
     else:
-        does = f"explains {percent(cause.share)} of it" if is_part else "explains it"
+        does = f"explains {percent(cause.share)} of the misfit" if is_part else "explains the misfit"
     return f"{name} {does} ({cause.sigmas:.0f} sigma); remedy: {remedy}"
 
 
@@ -448,7 +448,7 @@ def profile(p: Profile, e: Estimate) -> str:
     elif math.isinf(fisher[1]):
         comparison = f"{between(low, high)}{unit}; the Fisher information gives no bound"
     elif p.agrees:
-        comparison = f"{between(low, high)}{unit}, as by the Fisher information"
+        comparison = f"{between(low, high)}{unit}; the Fisher information gives the same interval"
     else:
         comparison = f"{between(low, high)}{unit}; by the Fisher information {between(*fisher)}{unit}"
     found = [comparison]
@@ -516,7 +516,7 @@ def remedies(study: Study, *, stopped: bool) -> list[str]:
         found.append(f"estimate {_every(e)}: {again}{_options(study)}")
     otherwise = "if that does not fit either, " if found else ""
     if e.bench.machine is None:
-        found.append(f"{otherwise}find a model that explains it: {again} --model all")
+        found.append(f"{otherwise}find a model that explains the record: {again} --model all")
     else:
         if border := [c.label for c in study.conclusions if Doubt.AT_BORDER in c.finding.doubts]:
             found.append(f"enter another guess of {', '.join(border)} in the map: a factor of 10 about it is searched")

@@ -136,9 +136,9 @@ def budget(study: Study) -> Table | None:
         )
     header = ["parameter", "noise", "sensors", "J, scales", "effects", "total", "by residuals", "largest"]
     title = (
-        "Uncertainty budget of the total, each half of a 95 % interval (k=2). Noise and systematic errors of the "
-        "sensors; inertia, scales of angle and current; effects that the record cannot exclude. For comparison: by the "
-        "scatter of the residuals"
+        "Uncertainty budget of the total, each half of a 95 % interval (k=2): noise and systematic errors of the "
+        "sensors; inertia, scales of angle and current; effects that the record cannot exclude. By residuals: the "
+        "noise's part computed from the scatter of the residuals"
     )
     return Table(title, header, rows, words=(0, 7))
 
@@ -153,7 +153,7 @@ def ratios(e: Estimate) -> Table | None:
         ]
         for one in e.ratios()
     ]
-    title = "Ratios, in which an error of the inertia has no part; ± is the total (95 %, k=2)"
+    title = "Ratios, which do not depend on the error of the inertia; ± is the total (95 %, k=2)"
     return Table(title, ["ratio", "value ± total", "total"], rows) if rows else None
 
 
@@ -211,8 +211,8 @@ def suspects(e: Estimate) -> Table | None:
         suggested = suggested if s.possible else NOTHING
         rows.append([name, suggested, signed(s.sigmas, "+.1f"), chance(s.p_value)])
     title = (
-        "Score tests for effects that the model lacks: first-order amount, if a brake can have it; one-sided p if the "
-        "effect is positive"
+        "Score tests for effects that the model lacks: amount to first order, if it is possible; one-sided p if the "
+        "effect cannot be negative"
     )
     return Table(title, ["effect", "amount", "sigma", "p"], rows) if rows else None
 

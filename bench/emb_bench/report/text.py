@@ -16,7 +16,7 @@ from emb_runtime.system import terminal
 WIDTH = 80  # Columns of a text
 BAD = r"(?P<bad>^(WARNING|STOPPED|OUTSIDE):.*|^.*DOES NOT [A-Z]+|NOT [a-z]+|LIMITS LEFT|FAILED|\bNO\b|AT THE BORDER)"
 CARE = r"(?P<care>^NOTE:|^SIMULATED:|if the model is right|identified, but biased)"
-GOOD = r"(?P<good>^The model '[^']*' fits\b|limits held|\byes$)"  # Words that stand out in colour
+GOOD = r"(?P<good>^The model '[^']*' fits\b|limits kept|\byes$)"  # Words that stand out in colour
 
 
 class Cell(str):

@@ -69,11 +69,11 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--drive", required=True, metavar="BUS", help="bus of the drive: can0")
     p.add_argument("--node", required=True, metavar="BUS", help="bus of the node: vcan0, can1")
     p.add_argument("--bench", type=Path, metavar="FILE", help="bench file, the same as for emb-run")
+    p.add_argument("--serial", default="", metavar="TEXT", help="serial number of a drive that reports no identity")
     p.add_argument(
-        "--serial", default="", metavar="TEXT", help="serial number on the drive, which has no other identity"
-    )
-    p.add_argument(
-        "--listen", action="store_true", help="send nothing to a drive that broadcasts: samples only, nothing is armed"
+        "--listen",
+        action="store_true",
+        help="only show the samples of a drive that broadcasts: nothing is sent or armed",
     )
     p.add_argument("--yes", action="store_true", help="do not ask before the drive is armed")
     p.add_argument("--no-rt", action="store_true", help="leave scheduling and memory alone")

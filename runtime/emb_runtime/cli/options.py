@@ -106,7 +106,7 @@ def parser() -> argparse.ArgumentParser:
         help="policy as ONNX file with its contract (default: the shipped one)")
     actor.add_argument("--quick", action="store_true",
         help="use the shipped policy for a short experiment: it returns home and ends when all four parameters have "
-        f"a repeatability of {QUICK_GOAL}% (the total also has the error of J), or to that of --stop-when")
+        f"a repeatability of {QUICK_GOAL}%, or that of --stop-when (the total also includes the error of J)")
     what.add_argument("--bench", type=Path, metavar="FILE", help="bench file (default: the shipped drum brake)")
     what.add_argument("--log", type=_place, default=Path("runs"), metavar="FILE|DIR",
         help="MCAP file to write (a name with a suffix), or a folder for a file named after the time (default: runs/)")
@@ -156,8 +156,8 @@ def parser() -> argparse.ArgumentParser:
     machine.add_argument("--no-watchdog", dest="watchdog", action="store_false",
         help="no watchdog process: for a bus without a brake")
     machine.add_argument("--long-timeouts", action="store_true",
-        help="accept longer time-outs of the bench file than the shipped ones: for a bus without a brake on a computer "
-        "that has other work")
+        help="accept longer time-outs of the bench file than the shipped ones: for a bus without a brake on a busy "
+        "computer")
 
     p.add_argument("--write-bench", type=Path, metavar="FILE",
         help="write the shipped bench file, and its JSON schema for editors beside it, and exit")

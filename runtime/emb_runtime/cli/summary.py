@@ -24,7 +24,7 @@ SAMPLES = (
     "{missed} periods missed, {rejected} frames rejected, {dropped} dropped by the kernel"
 )
 MOTION = "unexplained velocity {unexplained:.0f} rad/s, limit {unexplained_allowed:.0f} rad/s"
-NOT_JUDGED = "not judged: too little motion, or the bench declares a lag or frames older than two samples"
+NOT_JUDGED = "no verdict: too little motion, or the bench declares a lag or frames older than two samples"
 NOT_PROVEN = "NOT PROVEN: too little motion, so the speed stayed low"
 
 

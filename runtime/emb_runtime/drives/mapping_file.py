@@ -200,7 +200,7 @@ def _text(path: str | Path, most: int, encoding: str = "") -> str:
         return decode(read_bytes(path, most), encoding)
     except (OSError, UnicodeDecodeError) as err:
         reason = err.strerror if isinstance(err, OSError) else f"not text in UTF-8{'' if encoding else ' or cp1252'}"
-        raise MappingError(f"{path}: cannot read it: {reason}") from err
+        raise MappingError(f"{path}: cannot read the file: {reason}") from err
 
 
 # --- with its DBC ---------------------------------------------------------------------------------------------------

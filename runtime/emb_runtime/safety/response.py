@@ -413,4 +413,4 @@ class Response:
         delay = state.mean[1] * model.current * model.sample_time
         most = model.age + model.extra / model.sample_time
         found = f"{model.age + late / delay:z.1f} ± {error / delay:.1f}"
-        return f"the velocity follows the commands {found} samples late, at most {most:.3g} are declared"
+        return f"the velocity follows the commands with a delay of {found} samples, at most {most:.3g} are declared"

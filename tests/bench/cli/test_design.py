@@ -39,7 +39,7 @@ def test_the_file_holds_a_design_that_can_be_simulated_again(
     out, theta = tmp_path / "design.csv", tmp_path / "estimate.json"
     theta.write_text('{"parameters": {"f_v": 3e-5}}')
     assert main(["--bench", str(short), *QUICK, "--theta", str(theta), "--seed", "4", "--output", str(out)]) == 0
-    assert "limits held, home" in capsys.readouterr().out
+    assert "limits kept, home" in capsys.readouterr().out
     bench, (head, *rest) = load_bench(short), out.read_text(encoding="utf-8").splitlines()
     metadata = json.loads(head.removeprefix("# "))
     time, current, angle, velocity = np.array([[float(v) for v in row] for row in list(csv.reader(rest))[1:]]).T

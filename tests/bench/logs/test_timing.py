@@ -213,7 +213,7 @@ def test_without_budgets_there_is_nothing_to_judge_by(write: Write, replay: Repl
     for name, budgets in enumerate((None, "[budgets]\n", "[budgets.age]\n")):
         path = write(punctual(), budgets, name=f"{name}.mcap")
         assert verdicts(replay, path, code=2) == {}
-        assert "not judged" in replay.text("timing", path, "-q", code=2)
+        assert "no verdict" in replay.text("timing", path, "-q", code=2)
 
 
 def test_of_several_logs_one_that_is_not_met_decides(write: Write, replay: Replay) -> None:

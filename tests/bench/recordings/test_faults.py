@@ -216,7 +216,7 @@ def test_a_fault_comes_before_any_suspect_and_has_an_exit_code(
         said = " ".join(capsys.readouterr().out.split())
         assert fault.said in said
         assert "correct the map by the first line" in said
-        assert "explains it" not in said
+        assert "explains the misfit" not in said
 
 
 def test_the_remedy_for_what_the_model_lacks_works_as_it_is_printed(

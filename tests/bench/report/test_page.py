@@ -142,8 +142,8 @@ def test_a_terminal_shows_verdicts_in_colour_unless_it_is_asked_not_to(
 @pytest.mark.parametrize(
     ("plant", "text", "said"),
     [
-        ("stribeck", "square:period=0.2", "a static friction beyond T_c of about 20 % explains it (24 sigma)"),
-        ("late", "chirp", "a delay of the commands explains 99 % of it (31 sigma)"),
+        ("stribeck", "square:period=0.2", "a static friction beyond T_c of about 20 % explains the misfit (24 sigma)"),
+        ("late", "chirp", "a delay of the commands explains 99 % of the misfit (31 sigma)"),
     ],
 )
 def test_an_effect_explains_a_misfit_only_where_none_is_left(bench: Bench, plant: str, text: str, said: str) -> None:
@@ -152,7 +152,7 @@ def test_an_effect_explains_a_misfit_only_where_none_is_left(bench: Bench, plant
     m = e.validation
     assert m.cause is not None
     left = (m.chi2 - m.cause.suspect.fall) / (m.freedom - 1)
-    assert (m.cause.share == 1.0) is (left <= m.expected[1]) is ("% of it" not in said)
+    assert (m.cause.share == 1.0) is (left <= m.expected[1]) is ("% of the misfit" not in said)
 
 
 @pytest.mark.parametrize("text", ["chirp", "square:period=0.2"])
@@ -171,7 +171,7 @@ def test_two_terms_of_a_curve_that_nearly_cancel_are_named_together(
 @pytest.mark.parametrize(
     ("quadratic", "said"),
     [
-        (0.0005, "a quadratic stiffness of about 0.00048 1/rad explains it (28 sigma)"),
+        (0.0005, "a quadratic stiffness of about 0.00048 1/rad explains the misfit (28 sigma)"),
         (0.0001, "a quadratic stiffness is the most significant (10 sigma)"),
     ],
 )

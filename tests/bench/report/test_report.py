@@ -255,7 +255,7 @@ def test_the_pale_line_of_a_profile_is_the_parabola_of_the_fisher_information(
 
 def test_every_effect_of_the_tests_and_of_the_budget_is_explained_on_the_page_in_one_line(report: Report) -> None:
     study = report.numbers["estimate"]
-    words = report.reader.text.partition("What the words mean")[2]
+    words = report.reader.text.partition("Terms")[2]
     named = {s["name"] for s in study["misfit"]["suspects"]} | {b["name"] for b in study["misfit"]["budget"]}
     assert {"play", "f_l", "contact", "hysteresis", "T_c_drift", "angle_scale"} <= named
     for name in named:
@@ -297,7 +297,7 @@ def test_without_systematic_errors_nothing_says_that_they_are_in_the_total(
 ) -> None:
     options = ("--systematic", "none", "--starts", "1")
     made = make(folder / "noise.html", good, *options)
-    verdict = made.reader.text.partition("What the words mean")[0]
+    verdict = made.reader.text.partition("Terms")[0]
     for said in (verdict, replay.text("estimate", good, *options), replay.text("estimate", good, *options, "-v")):
         flat = " ".join(said.split())
         assert "by sensor noise alone" in flat

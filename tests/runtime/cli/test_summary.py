@@ -87,7 +87,7 @@ def test_every_count_and_every_trouble_has_its_words_and_an_undisturbed_run_few(
         ({"log": lost}, "INCOMPLETE: disk full"),
         ({"node_stop_reason": StopReason.LIMIT}, "LIMIT"),
         ({"node_stop_reason": None}, "stop reason not reported"),
-        ({"unexplained": (3.6, math.inf)}, "not judged"),
+        ({"unexplained": (3.6, math.inf)}, "no verdict"),
         (
             {"estimate": (0.02, 23.0, 0.01, 2e-5, 0.006, 6.6, 0.003, 6e-6), "model_fits": False},
             "THE MODEL DOES NOT FIT",

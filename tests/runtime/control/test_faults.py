@@ -216,7 +216,7 @@ def test_a_response_that_is_declared_is_proven_and_the_outcome_says_so(
     ran = simulate(options=f"plant={plant}", on_bench=dataclasses.replace(SENSOR_BENCH, **declared))
     assert ran.outcome.fault is None, ran.outcome.detail
     assert re.fullmatch(
-        r"the velocity follows the commands -?\d\.\d ± \d\.\d samples late, at most [\d.]+ are declared",
+        r"the velocity follows the commands with a delay of -?\d\.\d ± \d\.\d samples, at most [\d.]+ are declared",
         ran.outcome.response,
     )
 

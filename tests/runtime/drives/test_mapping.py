@@ -252,11 +252,11 @@ def test_a_command_of_any_signal_is_decoded_as_the_current_that_was_meant_or_the
 
 
 def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
-    with pytest.raises(MappingError, match=r"nowhere\.toml: cannot read it"):
+    with pytest.raises(MappingError, match=r"nowhere\.toml: cannot read the file"):
         load_mapping(tmp_path / "nowhere.toml")
     path = tmp_path / "drive.toml"
     path.write_text(texts("odrive")[0])
-    with pytest.raises(MappingError, match=r"odrive\.dbc: cannot read it"):
+    with pytest.raises(MappingError, match=r"odrive\.dbc: cannot read the file"):
         load_mapping(path)
     (tmp_path / "odrive.dbc").write_text("no DBC")
     with pytest.raises(MappingError, match=r"can\.dbc: DBC: not readable"):

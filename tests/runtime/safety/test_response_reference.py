@@ -330,8 +330,8 @@ def test_a_run_has_the_slow_law_until_its_response_is_proven_and_again_in_the_ne
         assert response.proven
         assert response.law == SHIPPED
         assert response.rows == [Row(False, 0.0, 0.0, 0.0), *sliding(0)[: len(response.rows) - 1]]
-        assert response.description.startswith("the velocity follows the commands 0.0 ± 0.")
-        assert response.description.endswith(" samples late, at most 0 are declared")
+        assert response.description.startswith("the velocity follows the commands with a delay of 0.0 ± 0.")
+        assert response.description.endswith(" samples, at most 0 are declared")
 
 
 def test_a_delay_that_is_negative_by_less_than_is_told_has_no_sign() -> None:
@@ -341,12 +341,12 @@ def test_a_delay_that_is_negative_by_less_than_is_told_has_no_sign() -> None:
         response.add_sample(
             sample(row._replace(velocity=row.velocity + dice.gauss(0.0, 0.5))), row.follows, row.command
         )
-    assert response.description.startswith("the velocity follows the commands 0.0 ± 0.")
+    assert response.description.startswith("the velocity follows the commands with a delay of 0.0 ± 0.")
 
 
 def told(text: str) -> tuple[float, float, float]:
     """Measured delay, its standard deviation and what is declared [samples]."""
-    form = r"the velocity follows the commands (\S+) ± (\S+) samples late, at most (\S+) are declared"
+    form = r"the velocity follows the commands with a delay of (\S+) ± (\S+) samples, at most (\S+) are declared"
     numbers = re.fullmatch(form, text)
     assert numbers is not None
     late, error, most = map(float, numbers.groups())
