@@ -1,4 +1,4 @@
-"""Periods of which it is not known what acted: their currents, or where the brake was after them, are unknowns."""
+"""Periods of which it is not known what acted are unknowns; outliers are counted, and move no parameter."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from emb_bench.analysis.model_choice import choose_model, fit_from
 from emb_bench.config.bench import Bench
 from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.least_squares import regression
+from emb_bench.estimate.output_error import few, outliers
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.simulate import gap_ends
 from emb_bench.report.caveats import caveats
 from emb_runtime.config.bench import PARAMETER_NAMES
-
-from tests.bench.measurements import currents_of, errors_in_sigmas, fit, problem_of, record  # isort: skip
+from tests.bench.measurements import currents_of, errors_in_sigmas, fit, problem_of, record
 
 SINGLE = (40, 90, 300)
 SEVERAL = (range(150, 170), range(230, 232))
@@ -113,17 +113,6 @@ def test_what_is_fitted_again_or_by_another_model_settles_its_own_gaps(bench: Be
     assert caveats(choice.best.estimate) == caveats(e) != []
 
 
-def test_the_first_periods_of_a_record_keep_their_gaps_and_what_was_found_in_them(bench: Bench) -> None:
-    whole = record(bench, bench.plant("exact"), currents_of(bench, "chirp"))
-    data = replace(lossy(whole, EVERY), places=np.array([[1.0, 2.0], [3.0, 4.0]]))
-    cut = data.until(200)
-    assert [kind.tolist() for kind in cut.gaps] == [[40, 90], [169]]
-    assert cut.places is not None
-    assert cut.places.tolist() == [[1.0, 2.0]]
-    assert len(cut.currents) == len(cut.samples) == 200
-    assert whole.until(200).gap_unknowns == 0
-
-
 def test_innovations_of_the_right_brake_are_as_large_as_stated_whatever_is_assumed_of_its_gaps(bench: Bench) -> None:
     whole = record(bench, bench.plant("exact"), currents_of(bench, "chirp"), seed=8)
     for assumed in (0.0, -6.0):
@@ -199,3 +188,50 @@ def test_of_late_samples_those_that_show_the_inside_of_a_gap_do_not_count(bench:
     assert np.flatnonzero(~counts).tolist() == list(range(100, 110))
     shorter = lossy(data, [])
     assert shorter.gap_unknowns == 0
+
+
+def with_jumps(data: Experiment, *jumps: tuple[int, int, float]) -> Experiment:
+    """The record whose samples show some more at some places: sample, output, and by how much."""
+    samples = data.samples.copy()
+    for k, output, by in jumps:
+        samples[k, output] += by
+    return replace(data, samples=samples)
+
+
+@pytest.mark.parametrize("jump", [(250, 0, 5.0), (3, 0, -5.0), (400, 1, 100.0), (499, 0, 0.05)])
+def test_a_jump_of_one_sample_moves_no_parameter_by_more_than_its_interval(
+    bench: Bench, jump: tuple[int, int, float]
+) -> None:
+    plant = bench.plant("exact")
+    data = record(bench, plant, currents_of(bench, "chirp"), seed=2)
+    clean, found = fit(bench, plant, [data]), fit(bench, plant, [with_jumps(data, jump)])
+    assert found.validation.fits
+    assert found.experiments[0].outliers == 1
+    assert len(caveats(found)) == 1
+    low, high = clean.intervals().T
+    assert ((low < found.values) & (found.values < high)).all()
+    assert caveats(clean) == []
+
+
+def test_many_samples_apart_are_no_outliers_but_a_record_that_does_not_fit(bench: Bench) -> None:
+    plant = bench.plant("exact")
+    data = record(bench, plant, currents_of(bench, "chirp"), seed=2)
+    found = fit(bench, plant, [with_jumps(data, *((k, 0, 0.1) for k in range(50, 450, 40)))])
+    assert found.experiments[0].outliers == 0
+    assert not found.validation.fits
+
+
+def test_noise_that_is_larger_than_the_bench_says_is_not_outlying() -> None:
+    errors = 3.0 * np.random.default_rng(0).standard_normal((500, 2))
+    assert not outliers(errors, np.ones((500, 2), np.bool_)).any()
+
+
+def test_what_does_not_count_is_no_outlier_and_a_short_record_has_none() -> None:
+    errors, counts = np.zeros((100, 2)), np.ones((100, 2), np.bool_)
+    errors[50], counts[50] = 1e6, False
+    errors[70, 1] = -9.0
+    assert np.flatnonzero(outliers(errors, counts)).tolist() == [70]
+    assert not outliers(1e6 * np.eye(8, 2), np.ones((8, 2), np.bool_)).any()
+    assert not few([np.zeros(500, np.bool_)])
+    assert few([np.arange(500) < 5])
+    assert not few([np.arange(500) < 6])
