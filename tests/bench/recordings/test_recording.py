@@ -57,13 +57,6 @@ def test_a_csv_file_becomes_an_experiment_with_its_samples_and_the_machine(tmp_p
     assert bench.brake.f_v == 300.0
 
 
-def test_a_machine_that_stands_still_is_read_as_any_other(tmp_path: Path) -> None:
-    still = RECORDING._replace(position=np.full_like(RECORDING.position, 0.1))
-    found = opened(tmp_path, csv(tmp_path / "r.csv", still))
-    assert not found.experiment.all_samples[:, 1].any()
-    assert found.bench.plant("recorded").mechanics.tolerance == 1e-8
-
-
 def test_what_a_recording_lacks_is_said_of_its_experiment(tmp_path: Path) -> None:
     experiment = opened(tmp_path, csv(tmp_path / "r.csv", RECORDING)).experiment
     assert {Lack.NO_COUNTERS, Lack.NO_VELOCITY, Lack.NO_CURRENT} <= experiment.quality.lacks.keys()
