@@ -18,11 +18,10 @@ from emb_bench import api
 from emb_bench.config.bench import load_bench
 from emb_bench.design import anneal
 from emb_bench.design import search as search_module
-from emb_bench.design.anneal import HOPELESS, PRICE, annealed, tracked, vary
-from emb_bench.design.polish import Settings, merit, polish
+from emb_bench.design.anneal import HOPELESS, PRICE, annealed, tracked
 from emb_bench.design.problem import MARGIN, Problem, make_problem
 from emb_bench.design.report import check
-from emb_bench.design.search import NEAR, coarse, search
+from emb_bench.design.search import search
 from emb_bench.estimate.expected import IntervalCriterion
 from emb_bench.information import symmetric
 from emb_bench.information.criteria import Criterion, Name, distances
@@ -89,24 +88,11 @@ def test_a_compiled_loop_has_the_same_phi(goal: Criterion, m: Floats, softness: 
     assert found == pytest.approx(float(goal.phi(m, softness)), rel=1e-6)
 
 
-@pytest.mark.parametrize("goal", GOALS, ids=lambda goal: goal.name)
-def test_a_compiled_loop_has_minus_infinity_where_nothing_is_known(goal: Criterion) -> None:
-    nothing = symmetric.pack(np.zeros((4, 4)))
-    assert symmetric.phi(goal.compiled, nothing, 0.03, np.empty((4, 4))) == -math.inf
-
-
 @given(information(), information())
 @pytest.mark.parametrize("goal", GOALS, ids=lambda goal: goal.name)
 def test_a_tangent_lies_above_its_criterion_everywhere(goal: Criterion, here: Floats, there: Floats) -> None:
     tangent = float(goal.phi(here)) + float((goal.gradient(here) * (there - here)).sum())
     assert float(goal.phi(there)) <= tangent + 1e-6 * (1.0 + abs(tangent))
-
-
-def test_many_matrices_are_judged_as_each_alone() -> None:
-    m = np.random.default_rng(0).normal(size=(5, 4, 7))
-    many = m @ m.transpose(0, 2, 1)
-    for goal in GOALS:
-        np.testing.assert_allclose(goal.phi(many), [float(goal.phi(one)) for one in many], rtol=1e-12)
 
 
 @given(information(), st.floats(1e-3, 0.1))
@@ -135,15 +121,6 @@ def test_the_distance_of_two_informations_is_found_in_no_direction_larger_and_in
     )
 
 
-def test_a_coarse_search_leaves_what_another_one_has_found() -> None:
-    p = problem("E", PARAMETER_NAMES, model="euler", horizon=200)
-    seed = np.random.SeedSequence(0)
-    found = coarse(p, 3, seed)
-    same, other = (distances(coarse(p, 3, seed, far).matrix[None], found.matrix)[0] for far in ([], [found]))
-    assert same == pytest.approx(0.0, abs=1e-6)
-    assert other > NEAR / 2.0
-
-
 @pytest.mark.parametrize("model", ["euler", "exact"])
 @pytest.mark.parametrize("params", [TWO, PARAMETER_NAMES, (*PARAMETER_NAMES, "J")], ids=len)
 def test_the_population_and_a_single_design_are_simulated_alike(model: str, params: tuple[str, ...]) -> None:
@@ -170,17 +147,6 @@ def test_a_brake_that_is_tracked_reaches_the_speeds_of_a_design_again(model: str
     np.testing.assert_array_equal(again.states[1:, 1], tracks.speeds[0])
     assert again.phi == pytest.approx(float(p.criterion.phi(unpack(tracks.m[:, -1], 4))[0]))
     assert again.price == pytest.approx(tracks.price[0], abs=1e-9)
-
-
-@given(st.integers(0, 2**32 - 1), st.integers(3, 200))
-def test_a_variation_keeps_the_speeds_before_its_first_change_and_has_finite_ones_after_it(seed: int, n: int) -> None:
-    rng = np.random.default_rng(seed)
-    speeds = rng.uniform(-500.0, 500.0, n)
-    varied = speeds.copy()
-    first = vary(varied, 500.0, rng)
-    assert 0 <= first < n
-    np.testing.assert_array_equal(varied[:first], speeds[:first])
-    assert np.isfinite(varied).all()
 
 
 @pytest.mark.parametrize("model", ["euler", "exact"])
@@ -224,15 +190,6 @@ def test_with_limits_in_reach_no_feasible_sequence_of_a_grid_is_better() -> None
     designs = (p.design(np.array(u)) for u in itertools.product((-6.0, 0.0, 3.0, 6.0), repeat=6))
     best = max(design.phi for design in designs if design.feasible)
     assert search(p, starts=2, seed=0).best.phi > best
-
-
-def test_a_polish_gains_and_comes_back_into_the_box() -> None:
-    p = problem()
-    start = p.design(out_and_back(120))
-    assert not start.feasible
-    end = polish(p, start.currents, Settings(steps=30, tolerance=1e-6, cuts=3))
-    assert end.feasible
-    assert merit(end) > merit(start)
 
 
 @settings(max_examples=2)
@@ -325,12 +282,16 @@ def test_no_design_is_above_the_proved_bound(name: Name) -> None:
     assert phi[price == 0.0].max() < ceiling(p, goal)
 
 
-@pytest.mark.parametrize("name", ["T", "I", "T_c"])
-def test_a_design_for_the_interval_is_worth_what_an_estimate_is_expected_to_tell(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def _few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search for the interval of few designs, in this process."""
     monkeypatch.setattr(search_module, "FEW", 60)
     monkeypatch.setattr(search_module, "shared_out", lambda work, pieces, *_: enumerate(map(work, pieces)))
+
+
+@pytest.mark.usefixtures("_few")
+@pytest.mark.parametrize("name", ["T", "I", "T_c"])
+def test_a_design_for_the_interval_is_worth_what_an_estimate_is_expected_to_tell(name: str) -> None:
     bench = load_bench()
     p = replace(make_problem(bench, IntervalCriterion(name), PARAMETER_NAMES), horizon=120)
     told: list[str] = []
@@ -348,9 +309,8 @@ def test_a_design_for_the_interval_is_worth_what_an_estimate_is_expected_to_tell
     assert check(bench, p, "physical", found.best.currents, "exact").value == found.best.phi
 
 
-def test_a_search_for_the_interval_goes_on_from_the_table_of_another_brake(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(search_module, "FEW", 60)
-    monkeypatch.setattr(search_module, "shared_out", lambda work, pieces, *_: enumerate(map(work, pieces)))
+@pytest.mark.usefixtures("_few")
+def test_a_search_for_the_interval_goes_on_from_the_table_of_another_brake() -> None:
     bench = load_bench()
     first = replace(make_problem(bench, IntervalCriterion("T"), PARAMETER_NAMES), horizon=120)
     other = replace(first, brake=bench.brake._replace(T_c=0.7 * bench.brake.T_c))
@@ -365,10 +325,9 @@ def test_a_search_for_the_interval_goes_on_from_the_table_of_another_brake(monke
     assert found.best.phi > search(other, starts=1, seed=1).best.phi
 
 
-def test_an_interrupted_search_keeps_the_best_design_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("_few")
+def test_an_interrupted_search_keeps_the_best_design_so_far() -> None:
     """As soon as one can keep the limits: a coarse one for T, a polished one for D."""
-    monkeypatch.setattr(search_module, "FEW", 60)
-    monkeypatch.setattr(search_module, "shared_out", lambda work, pieces, *_: enumerate(map(work, pieces)))
     of_interval = replace(make_problem(load_bench(), IntervalCriterion("T"), PARAMETER_NAMES), horizon=120)
 
     def told_until(last: str) -> Callable[[str], None]:
