@@ -1,4 +1,4 @@
-"""``emb-design``: what it writes, and how it says no."""
+"""``emb-design``: what it writes, and what is no design of a bench."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from emb_runtime.errors import EXIT_INTERRUPTED, UsageError
 
 from tests.bench.flows import fisher  # isort: skip
 from tests.benches import SENSOR_TEXT
-from tests.commands import refused
 
 PERIODS = 50
 QUICK = ["--criterion", "D", "--starts", "1", "--params", "k_m,T_c", "--model", "euler"]
@@ -124,13 +123,3 @@ def test_ctrl_c_writes_the_best_design_so_far(
 def test_the_weighted_information_has_no_bound(short: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--bench", str(short), *QUICK, "--kind", "weighted", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["cramer_rao"] is None
-
-
-@pytest.mark.parametrize("theta", ["log", "true", "nominl"])
-def test_a_design_has_no_log_to_take_the_parameters_from(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, theta: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    said = refused(lambda: main(["--theta", theta]), capsys)
-    assert "--theta: expected nominal, name=value or a file" in said
-    assert ("did you mean nominal?" in said) == (theta == "nominl")

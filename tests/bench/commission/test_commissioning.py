@@ -342,18 +342,6 @@ def test_every_step_is_confirmed_unless_told_otherwise_or_nobody_else_is_on_the_
             assert ("--yes" in given) is (more == ["--yes"])
 
 
-def test_what_cannot_be_done_is_a_line_and_an_exit_code(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "file").write_text("")
-    for folder in ("file", "file/below"):
-        assert commission.main([str(tmp_path / folder)]) == 2
-        assert capfd.readouterr().err.count("\n") == 1
-    sent_nothing = ["--bench", str(tmp_path / "sheet.toml"), "--iface", "can0", str(tmp_path / "brake"), "--no-rt"]
-    (tmp_path / "sheet.toml").write_text(sheet().text)
-    assert commission.main(sent_nothing) == 4  # the bus is looked for before anybody who could confirm
-    assert capfd.readouterr().err.startswith("emb-commission: can0: ")
-    assert not (tmp_path / "brake").exists()
-
-
 SILENT = """
 import time
 from emb_runtime.system.clock import MonotonicClock
