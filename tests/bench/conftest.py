@@ -15,7 +15,7 @@ from emb_bench.config.bench import Bench
 
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.benches import SENSOR_BENCH  # isort: skip
-from tests.conftest import Simulate, simulating  # isort: skip
+from tests.conftest import SimRun, Simulate, simulating  # isort: skip
 
 Log = Callable[..., Path]
 
@@ -79,3 +79,18 @@ def log(tmp_path: Path, simulate: Simulate) -> Log:
         return write_log(tmp_path / name, simulate(square, options=options, **run))
 
     return write
+
+
+STEPS = 60
+
+
+@pytest.fixture
+def run(simulate: Simulate) -> SimRun:
+    """A short one."""
+    return simulate(square, steps=STEPS, options="f_v=3e-5,seed=7")
+
+
+@pytest.fixture
+def path(tmp_path: Path, run: SimRun) -> Path:
+    """Its log."""
+    return write_log(tmp_path / "run.mcap", run, steps=STEPS)

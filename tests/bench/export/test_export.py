@@ -17,17 +17,14 @@ import pytest
 
 from emb_bench.cli.replay import main
 from emb_bench.experiment.from_log import read_experiment
-from emb_bench.export.export import TABLES
 from emb_bench.export.mjcf import mjcf
 from emb_bench.export.picture import broken, draw_run
-from emb_bench.figures import PICTURES
 from emb_bench.logs.log import RunLog, read_log
 from emb_runtime.config.bench import load_bench
 from emb_runtime.log.ring_buffer import EventRecord
 from emb_runtime.records import CycleRecord, RunState
 
-from tests.bench.conftest import Replay  # isort: skip
-from tests.bench.export.conftest import STEPS  # isort: skip
+from tests.bench.conftest import STEPS, Replay  # isort: skip
 from tests.bench.simulated_logs import WALL, square, write_log  # isort: skip
 from tests.conftest import SimRun, Simulate  # isort: skip
 
@@ -96,11 +93,15 @@ def test_no_text_of_a_log_is_a_formula_in_a_spreadsheet(simulate: Simulate, tmp_
     assert float(rows[1]["angle_min"]) < 0.0  # a number stays one
 
 
-def test_parquet_has_the_same_numbers_and_units_and_says_what_is_missing(path: Path, tmp_path: Path) -> None:
+def test_parquet_has_the_same_numbers_and_units_and_says_what_is_missing(
+    path: Path, tmp_path: Path, replay: Replay
+) -> None:
     cut, out = tmp_path / "cut.mcap", tmp_path / "out.parquet"
     cut.write_bytes(path.read_bytes()[:-5])
     log = read_log(cut)
-    assert export(cut, "-o", out) == 0
+    document = replay.document("export", cut, "-o", out)
+    assert document["holds"] == f"{log.counts['/cycle']} rows of /cycle"
+    assert document["missing"] == log.missing
     table = pq.read_table(out)
     assert table.column_names == ["time", "unix_time", *CycleRecord._fields]
     for name in ("angle", "velocity", "sent_current", "policy_current", "step", "send_time_ns"):
@@ -169,20 +170,6 @@ def test_the_clamp_of_an_exported_brake_pushes_only_in_contact() -> None:
 def test_no_line_is_drawn_through_periods_that_were_missed() -> None:
     values, missed = np.array([1.0, 2.0, 3.0, 4.0]), np.array([0, 2, 0, 1])
     np.testing.assert_array_equal(broken(values, missed), [1.0, np.nan, 2.0, 3.0, np.nan, 4.0])
-
-
-def test_an_incomplete_log_is_exported_with_a_warning_first(path: Path, tmp_path: Path, replay: Replay) -> None:
-    cut = tmp_path / "cut.mcap"
-    cut.write_bytes(path.read_bytes()[:-5])
-    for ending in (*PICTURES, *TABLES):
-        out = tmp_path / f"out{ending}"
-        said = replay.text("export", cut, "-o", out).splitlines()
-        assert said[0].startswith("WARNING: the file is cut at byte")
-        assert said[1].startswith(f"{out}: ")
-        assert out.stat().st_size > 100
-    document = replay.document("export", cut, "-o", tmp_path / "2.csv")
-    assert document["holds"] == f"{read_log(path).counts['/cycle']} rows of /cycle"
-    assert document["missing"].startswith("the file is cut")
 
 
 def test_a_missing_extra_is_named(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, replay: Replay) -> None:

@@ -16,10 +16,10 @@ from emb_bench.logs.log import read_log
 from emb_runtime.log.ring_buffer import FrameRecord
 from emb_runtime.records import Frame
 
-from tests.bench.simulated_logs import WALL, square, write_log  # isort: skip
-from tests.conftest import SimRun, Simulate  # isort: skip
+from tests.bench.conftest import STEPS  # isort: skip
+from tests.bench.simulated_logs import WALL, write_log  # isort: skip
+from tests.conftest import SimRun  # isort: skip
 
-STEPS = 40
 FIELDS = (
     "timestamp",
     "arbitration_id",
@@ -38,8 +38,7 @@ def facts(messages: Iterable[can.Message], fields: tuple[str, ...] = FIELDS) -> 
 
 
 @pytest.fixture
-def run(simulate: Simulate) -> SimRun:
-    run = simulate(square, steps=STEPS)
+def run(run: SimRun) -> SimRun:
     last = max(frame.time_ns for frame in run.journal.frames)
     for frame in (  # what a run on a real bus also sees
         Frame(0x1ABCDEF, b"\x01\x02", last + 1_000_000, extended=True),
@@ -49,11 +48,6 @@ def run(simulate: Simulate) -> SimRun:
     ):
         run.journal.push(FrameRecord(frame))
     return run
-
-
-@pytest.fixture
-def path(tmp_path: Path, run: SimRun) -> Path:
-    return write_log(tmp_path / "run.mcap", run, steps=STEPS)
 
 
 def test_a_log_can_be_read_twice_and_a_cut_one_as_far_as_it_goes(

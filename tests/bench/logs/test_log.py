@@ -28,21 +28,10 @@ from emb_runtime.errors import LogError, UsageError
 from emb_runtime.log.recorder import Recorder
 from emb_runtime.log.ring_buffer import Attachment, EventRecord, LogHeader
 from emb_runtime.records import CycleRecord
-from tests.bench.simulated_logs import WALL, square, write_log
-from tests.conftest import SimRun, Simulate
+from tests.bench.conftest import STEPS
+from tests.bench.simulated_logs import WALL, write_log
+from tests.conftest import SimRun
 from tests.corrupt import rewritten
-
-STEPS = 12
-
-
-@pytest.fixture
-def run(simulate: Simulate) -> SimRun:
-    return simulate(square, steps=STEPS, options="f_v=3e-5,seed=7")
-
-
-@pytest.fixture
-def path(tmp_path: Path, run: SimRun) -> Path:
-    return write_log(tmp_path / "run.mcap", run, steps=STEPS)
 
 
 def test_a_finished_log_gives_back_what_the_run_pushed(path: Path, run: SimRun) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from emb_bench.logs.log import read_log
-from emb_bench.logs.timing import INTERVALS, Timing, timing, timing_numbers
+from emb_bench.logs.timing import INTERVALS, Timing, timing
 from emb_runtime.can.e2e import NO_COUNTER
 from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import Bench, parse_bench, shipped_bench_text
@@ -88,6 +88,17 @@ def test_a_missed_period_is_counted_and_is_no_long_one(measure: Measure) -> None
     assert len(t.period) == 7
 
 
+def test_an_unanswered_sample_has_a_period_and_nothing_else_and_cycles_outside_the_experiment_none(
+    measure: Measure,
+) -> None:
+    stopping = cycle(3, START + 700 * MS, state=int(RunState.STOPPING))
+    within = [cycle(0, START), unanswered(1, START + MS), cycle(2, START + 2 * MS)]
+    t = measure(cycle(-1, START - 9 * MS), *within, stopping)
+    assert t.unanswered == 1
+    np.testing.assert_allclose(t.period, [1e-3, 1e-3])
+    assert [len(t.interval(name)) for name in INTERVALS if name != "period"] == [2] * 5
+
+
 @pytest.mark.parametrize("drift", [0.0, 25e-6, -180e-6, 0.01])
 def test_the_device_clock_s_drift_and_jitter_come_from_a_straight_line(measure: Measure, drift: float) -> None:
     n = np.arange(200)
@@ -100,13 +111,6 @@ def test_the_device_clock_s_drift_and_jitter_come_from_a_straight_line(measure: 
     assert t.clock.jitter == pytest.approx(20e-6 * np.sqrt(200 / 198), rel=1e-4)
     slope, offset = np.polyfit(n * 1e-3, (arrivals - START) * 1e-9, 1)
     np.testing.assert_allclose(t.clock.residuals, (arrivals - START) * 1e-9 - slope * n * 1e-3 - offset, atol=1e-11)
-
-
-def test_a_log_without_an_experiment_has_no_intervals_and_no_clock(measure: Measure) -> None:
-    t = measure(cycle(-1, START))
-    assert all(len(t.interval(name)) == 0 for name in INTERVALS)
-    assert t.clock is None
-    assert timing_numbers(t)["intervals"] == {name: {} for name in INTERVALS}
 
 
 def test_the_counts_are_the_loop_s_and_a_simulation_is_called_so(
