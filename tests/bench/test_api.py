@@ -80,21 +80,6 @@ def test_nothing_that_is_handed_on_says_where_its_user_keeps_files(
     assert [text for text in said if "own/" in text or str(tmp_path) in text] == []
 
 
-def test_a_log_s_bench_is_replaced_by_one_of_the_same_sample_time_only(log: Path, tmp_path: Path) -> None:
-    text = api.open_run(log).bench.text
-    same, slower = tmp_path / "same.toml", tmp_path / "slower.toml"
-    same.write_text(text.replace("[noise]", "[noise]\n", 1), encoding="utf-8")
-    slower.write_text(text.replace("sample_time = 1.0e-3", "sample_time = 1.1e-3"), encoding="utf-8")
-    run = api.open_run(log)
-    assert api.fisher_information(run, bench=same).fisher("physical").matrix.tolist() == (
-        api.fisher_information(run).fisher("physical").matrix.tolist()
-    )
-    with pytest.raises(UsageError, match="at least one run"):
-        api.estimate([])
-    with pytest.raises(UsageError, match="sample time"):
-        api.fisher_information(run, bench=slower)
-
-
 def test_a_topic_is_the_table_that_emb_replay_export_writes(log: Path, tmp_path: Path) -> None:
     path = tmp_path / "estimate.parquet"
     assert replay.main(["export", str(log), "--topic", "/estimate", "-o", str(path)]) == 0
@@ -146,6 +131,9 @@ class Session:
         self.map.write_text(MAP, encoding="utf-8")
         self.csv = folder / "machine.csv"
         self.frame.to_csv(self.csv, index=False)
+        self.slower = folder / "slower.toml"
+        text = self.run.bench.text.replace("sample_time = 1.0e-3", "sample_time = 1.1e-3")
+        self.slower.write_text(text, encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
@@ -345,6 +333,7 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], str]] = {
     "simulate(currents=[])": (lambda s: api.simulate(currents=[]), "expected 1 to 500 currents"),
     "simulate(currents='u')": (lambda s: api.simulate(currents="u"), "as numbers"),
     "estimate(DataFrame)": (lambda s: api.estimate(s.frame), "map='map.toml'"),
+    "estimate([])": (lambda s: api.estimate([]), "at least one run"),
     "estimate(3.0)": (lambda s: api.estimate(WRONG), "an opened log, its path, or a table with a map"),
     "estimate({name: arrays of two lengths}, map=)": (
         lambda s: api.estimate({"t": [1.0, 2.0], "x": [1.0]}, map=s.map),
@@ -392,6 +381,10 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], str]] = {
         "seed: expected a whole number from 0 of up to 18 digits, got '1.5'",
     ),
     "simulate(u)": (lambda s: api.simulate(CURRENTS), "simulate(currents=...)"),  # type: ignore[arg-type]
+    "fisher_information(run, bench=a slower one)": (
+        lambda s: api.fisher_information(s.run, bench=s.slower),
+        "sample time",
+    ),
     "fisher_information([])": (lambda s: api.fisher_information([]), "at least one run"),
     "fisher_information(empty array)": (lambda s: api.fisher_information(np.zeros(0)), "one current"),
     "fisher_information(a matrix)": (lambda s: api.fisher_information(np.eye(2)), "one row of currents"),
