@@ -1,3 +1,5 @@
+"""Models of a brake: chosen among the plants of the bench, or grown until the records ask for no more."""
+
 from __future__ import annotations
 
 import json
@@ -9,6 +11,7 @@ import pytest
 from scipy import stats
 
 from emb_bench.analysis.model_choice import choose_model
+from emb_bench.analysis.model_growth import ADDITIONS, addition_scores, grow_model
 from emb_bench.analysis.options import EstimateOptions
 from emb_bench.analysis.records import ModelChoice, mixture_interval
 from emb_bench.analysis.stages import make_study
@@ -16,18 +19,20 @@ from emb_bench.brake.motion import Floats
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import EVERY, Plant
 from emb_bench.estimate.effects import with_systematic
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.records import EstimationProblem, Unknown
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.report.estimate import study_document, study_text
 from emb_bench.report.sentences import models
 from emb_runtime.config.bench import PARAMETER_NAMES
-
-from tests.bench.flows import square  # isort: skip
-from tests.bench.measurements import currents_of, record  # isort: skip
-from tests.bench.report_pages import make  # isort: skip
-from tests.bench.simulated_logs import square as square_wave, write_log  # isort: skip
-from tests.conftest import Simulate  # isort: skip
+from emb_runtime.errors import UsageError
+from tests.bench.flows import square
+from tests.bench.measurements import currents_of, fit, record
+from tests.bench.report_pages import make
+from tests.bench.simulated_logs import square as square_wave
+from tests.bench.simulated_logs import write_log
+from tests.conftest import Simulate
 
 FACTORS = {"k_m": 0.9, "k_1": 1.2, "T_c": 1.3, "f_v": 1.4}
 
@@ -104,6 +109,9 @@ def test_a_study_with_all_models_says_which_it_took_and_why(bench: Bench, tmp_pa
     log = read_log(write_log(tmp_path / "a.mcap", simulate(square_wave, options="plant=stribeck")))
     found = make_study(bench, [log], EstimateOptions(model=EVERY, starts=1))
     assert found.estimate.plant.name == "stribeck"
+    alone = make_study(bench, [log], EstimateOptions(model="stribeck", starts=1)).estimate
+    assert found.estimate.unknowns == alone.unknowns, "with the errors that the bench cannot exclude"
+    assert found.estimate.intervals() == pytest.approx(alone.intervals(), rel=1e-5)
     said = study_document(found)
     # With the encoder's offset estimated too, 'offset' is 'exact'.
     assert [*{model["model"] for model in said["models"]} ^ {*bench.plants}] == said["models_left_out"] == ["offset"]
@@ -164,14 +172,46 @@ def test_plants_are_compared_with_the_errors_that_the_bench_cannot_exclude(bench
     assert e.values[e.labels.index("current_offset")] == pytest.approx(0.02, rel=0.2)
 
 
-@pytest.mark.slow
-def test_the_answer_allows_for_the_errors_of_the_bench_as_with_one_model(
-    bench: Bench, tmp_path: Path, simulate: Simulate
-) -> None:
-    log = read_log(write_log(tmp_path / "a.mcap", simulate(square_wave, options="plant=stribeck")))
-    found = make_study(bench, [log], EstimateOptions(model=EVERY, starts=2)).estimate
-    one = make_study(bench, [log], EstimateOptions(model="stribeck", starts=2)).estimate
-    assert found.unknowns == one.unknowns
-    assert found.intervals() == pytest.approx(one.intervals(), rel=1e-5)
-    ideal = make_study(bench, [log], EstimateOptions(model=EVERY, starts=2, systematic="none")).estimate
-    assert len(ideal.unknowns) < len(found.unknowns)
+PATHS = {
+    "exact": set(),
+    "stribeck": {"static friction"},
+    "load": {"static friction", "static friction by load"},
+    "cubic": {"curved stiffness"},
+    "hysteresis": {"hysteresis"},
+    "play": {"play"},
+    "lag": {"lag of the current"},
+}
+"""Additions that make the shipped bench's plants of ``exact``."""
+
+
+def grown(bench: Bench, true: str) -> Estimate:
+    data = record(bench, bench.plant(true), currents_of(bench, "chirp"), seed=3)
+    return grow_model(bench, bench.plant("exact"), [data], EstimationProblem(), starts=2, seed=0)
+
+
+@pytest.mark.parametrize(
+    "true", [n if n in ("exact", "stribeck") else pytest.param(n, marks=pytest.mark.slow) for n in PATHS]
+)
+def test_the_model_grows_to_the_brake_that_was_there_and_no_further(bench: Bench, true: str) -> None:
+    e = grown(bench, true)
+    plain, *added = e.plant.name.split(" + ")
+    assert plain == "exact"
+    assert set(added) == PATHS[true]
+    assert e.validation.fits
+    for unknown, value, deviation in zip(e.unknowns, e.values, e.between_runs(), strict=True):
+        if unknown.name in PARAMETER_NAMES:
+            truth = getattr(bench.brake, unknown.name)
+            assert value == pytest.approx(truth, abs=4.0 * deviation * truth)
+
+
+def test_under_the_right_model_the_scores_are_small(bench: Bench) -> None:
+    data = record(bench, bench.plant("exact"), currents_of(bench, "chirp"), seed=5)
+    scores = addition_scores(fit(bench, "exact", [data], EstimationProblem()))
+    assert set(scores) == set(ADDITIONS)
+    assert max(scores.values()) < 3.5
+
+
+def test_a_plant_that_is_not_solved_exactly_cannot_grow(bench: Bench) -> None:
+    data = record(bench, bench.plant("exact"), currents_of(bench, "chirp"))
+    with pytest.raises(UsageError):
+        grow_model(bench, bench.plant("euler"), [data], EstimationProblem(), starts=1, seed=0)

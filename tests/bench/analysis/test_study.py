@@ -1,5 +1,8 @@
+"""Studies of runs: what is concluded on each parameter, remedies that give the brake, and the clamping force."""
+
 from __future__ import annotations
 
+import re
 import shlex
 import shutil
 import tomllib
@@ -11,11 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from emb_bench import api
+from emb_bench.analysis.clamping import clamping
 from emb_bench.analysis.conclusion import Standing, conclude
 from emb_bench.analysis.options import EstimateOptions
 from emb_bench.analysis.profile import profile
 from emb_bench.analysis.stages import make_study
-from emb_bench.analysis.study import Code, verdict
+from emb_bench.analysis.study import Code, Study, verdict
 from emb_bench.api import simulate as simulate_run
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import CampaignOptions, Source
@@ -32,12 +37,12 @@ from emb_bench.report.sentences import alarms, apart, remedies
 from emb_bench.report.sentences import profile as sentence
 from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.errors import UsageError
-
-from tests.bench.conftest import Replay  # isort: skip
-from tests.bench.simulated_logs import square, write_log  # isort: skip
-from tests.bench.measurements import currents_of, fit, record  # isort: skip
-from tests.conftest import Simulate  # isort: skip
+from tests.bench.conftest import Replay
+from tests.bench.measurements import currents_of, fit, record
+from tests.bench.report_pages import make
+from tests.bench.simulated_logs import square, write_log
 from tests.benches import SENSOR_TEXT
+from tests.conftest import Simulate
 
 Log = Callable[[str], RunLog]
 PAIR = ("k_m", "f_v")
@@ -118,28 +123,21 @@ def test_nuisances_are_concluded_on_but_do_not_decide(bench: Bench, log: Log) ->
     assert replace(study, conclusions=(interest, nuisance)).unidentified == ()
 
 
-def test_estimate_report_and_campaign_agree_on_what_is_identified(
-    bench: Bench, log: Log, tmp_path: Path, simulate: Simulate
+def test_estimate_profile_and_campaign_agree_on_what_a_run_that_was_cut_short_identifies(
+    bench: Bench, tmp_path: Path, simulate: Simulate
 ) -> None:
-    calls = iter(range(10**6))
-    lagging = replace(bench, shield=bench.shield._replace(current_lag=0.002))
-    stopped = simulate(square, options="plant=lag,seed=1", on_bench=lagging, stop_requested=lambda: next(calls) > 545)
-    logs = [
-        log("plant=exact,seed=5"),
-        read_log(write_log(tmp_path / "short.mcap", simulate(square, options="plant=exact", steps=12), steps=12)),
-        read_log(write_log(tmp_path / "stopped.mcap", stopped)),
-    ]
-    verdicts = []
-    for one in logs:
-        plain, profiled = (make_study(bench, [one], EstimateOptions(starts=2, profile=p)) for p in (False, True))
-        row = evaluate_one(Source(str(one.path), "", one.path.name, "."), CampaignOptions(starts=2))
+    asked = iter(range(10**6))
+    stopped = simulate(square, options="plant=exact,seed=1", stop_requested=lambda: next(asked) > 545)
+    for run, steps in ((simulate(square, options="plant=exact", steps=12), 12), (stopped, 500)):
+        path = write_log(tmp_path / f"{steps}.mcap", run, steps=steps)
+        logs = [read_log(path)]
+        plain, profiled = (make_study(bench, logs, EstimateOptions(starts=1, profile=p)) for p in (False, True))
+        row = evaluate_one(Source(str(path), "", path.name, "."), CampaignOptions(starts=1))
         identified = [c.identified for c in plain.conclusions]
         assert identified == [c.identified for c in profiled.conclusions]
         assert identified == [row[f"{c.label}_identified"] for c in plain.conclusions]
-        verdicts.append(identified)
-    assert all(verdicts[0])
-    assert not all(verdicts[1])
-    assert make_study(bench, logs[2:], EstimateOptions(starts=2)).stops[0].reason == "INTERRUPTED"
+        assert steps == 500 or not all(identified)
+    assert plain.stops[0].reason == "INTERRUPTED"
 
 
 def test_the_bias_of_recursive_least_squares_is_not_held_against_the_model(bench: Bench, log: Log) -> None:
@@ -287,3 +285,71 @@ def test_profiles_with_all_priors_in_full_do_not_widen_averaged_intervals(bench:
     agreeing = [profile.label for profile in profiled.checks.profiles if profile.agrees]
     assert len(agreeing) >= 3
     assert [profiled[label].interval for label in agreeing] == [plain[label].interval for label in agreeing]
+
+
+SMALL = 0.01  # Draws are smaller than the errors by this: to first order they are the same
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("clamping") / "run.mcap"
+    api.simulate(made, plant="cubic", k_1=20.0, seed=3)
+    return made
+
+
+@pytest.fixture(scope="module")
+def clamped(path: Path) -> Study:
+    return api.estimate(path, nuisance="quadratic,cubic", starts=1)
+
+
+def test_the_totals_are_those_of_draws_from_the_covariance_and_of_the_angle_s_scale(clamped: Study) -> None:
+    e, rng, angle = clamped.estimate, np.random.default_rng(1), 40.0
+    names = [u.name for u in e.unknowns]
+    own = next(one for one in e.validation.budget if one.name == "angle_scale")
+    scale = SMALL * own.size * rng.standard_normal(400_000)  # which moves the unknowns by ``bias``
+    rest = e.covariance() - np.outer(own.bias, own.bias)
+    moved = SMALL * rng.multivariate_normal(np.zeros(len(names)), rest, len(scale))
+    moved += np.outer(scale / own.size, own.bias)
+    at = dict(zip(names, (e.values + moved * e.scale).T, strict=True))
+    x, gamma, m = angle / (1.0 + scale), e.bench.brake.gamma, e.plant.mechanics
+    force = at["k_1"] * x * (1.0 + at["quadratic"] * x + at["cubic"] * x**2)
+    drawn = {
+        "force": force,
+        "current": gamma * force / at["k_m"] - at["current_offset"],
+        "friction": (m.break_away * at["T_c"] + m.f_l * force) / gamma,
+    }
+    found = clamping(e, angle)
+    assert found is not None
+    for name, values in drawn.items():
+        one = getattr(found, name)
+        assert one.value == pytest.approx(float(values.mean()), rel=1e-3)
+        assert SMALL * one.total == pytest.approx(1.96 * float(values.std()), rel=0.02), name
+    assert found.current.total / found.current.value < 0.1 * found.force.total / found.force.value, "J is in the force"
+
+
+def test_a_brake_is_told_at_the_largest_angle_that_it_clamped_to(clamped: Study) -> None:
+    found, largest = clamped.clamping, float(clamped.estimate.experiments[0].samples[:, 0].max())
+    assert found is not None
+    assert 0.0 <= largest - found.angle < 1.1
+
+
+def test_no_force_is_told_of_what_is_not_known(path: Path, tmp_path: Path) -> None:
+    assert api.estimate(path, starts=1, model="exact").clamping is None, "the model does not fit"
+    api.simulate(tmp_path / "nominal.mcap", plant="exact", seed=3)
+    found = api.estimate(tmp_path / "nominal.mcap", starts=1, params="k_m,T_c,f_v")
+    assert found.model_fits
+    assert found.clamping is None, "k_1 is not estimated"
+
+
+def test_text_document_and_page_tell_the_same(path: Path, clamped: Study, replay: Replay, tmp_path: Path) -> None:
+    options = ("--nuisance", "quadratic,cubic", "--starts", "1")
+    found = clamped.clamping
+    assert found is not None
+    said = " ".join(replay.text("estimate", path, *options).split())
+    known = rf"clamping force known to 2(\.\d)? %: {found.force.value:.0f} ± \d+ N at {found.angle:.0f} rad, held by"
+    assert re.search(known, said), said
+    told = replay.document("estimate", path, *options)["clamping"]
+    assert told["angle"] == found.angle
+    assert told["force"] == {"value": found.force.value, "total": found.force.total, "unit": "N"}
+    page = " ".join(make(tmp_path / "page.html", path, *options).reader.texts)
+    assert f"Clamping force at {found.angle:.0f} rad from contact." in page
