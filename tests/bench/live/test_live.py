@@ -452,6 +452,7 @@ def test_an_empty_folder_says_what_to_type(tmp_path: Path) -> None:
             said = json.loads(page.recv(SECONDS))["empty"]
         process.send_signal(signal.SIGINT)
         assert process.wait(SECONDS) == EXIT_DONE
+        assert process.stderr.read() == "", "Ctrl-C is how watching a folder ends"
     assert said == "no log in my runs yet: in another terminal, emb-run --iface sim --log 'my runs/'"
 
 
@@ -633,13 +634,3 @@ def test_on_a_terminal_the_page_stays_until_ctrl_c_which_gives_the_exit_code_of_
         assert f"live at {page} in a browser" in said
         assert f"open {page} in one" in said or (tmp_path / "opened").read_text().strip() == page
     assert "no browser is found here" in said
-
-
-def test_ctrl_c_is_how_watching_a_folder_ends(tmp_path: Path) -> None:
-    arguments = [sys.executable, "-m", "emb_bench.cli.replay", "live", "--port", "0", str(tmp_path)]
-    with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr is not None
-        assert "shows the logs in" in process.stderr.readline()
-        process.send_signal(signal.SIGINT)
-        assert process.wait(SECONDS) == EXIT_DONE
-        assert process.stderr.read() == ""
