@@ -17,7 +17,7 @@ from emb_bench.rerun import Rerun, carried_policy, rerun
 from emb_bench.sim.transport import SimTransport
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.cli.main import main as emb_run
-from emb_runtime.config.bench import Bench, parse_bench
+from emb_runtime.config.bench import Bench
 from emb_runtime.control.loop import STOP_FRAME_NOT_SENT
 from emb_runtime.log.ring_buffer import EventRecord, FrameRecord, InputRecord, Record, pack, unpack
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
@@ -155,12 +155,6 @@ def test_ctrl_c_at_any_moment_happens_again_at_that_moment(hostile: Callable[...
         run = hostile(3, stop_after=asked, reading_us=100)
         assert run.outcome.fault is Fault.INTERRUPTED, asked
         assert_reproduced(again(run), run)
-
-
-def changed(bench: Bench, old: str, new: str) -> Bench:
-    """A bench with another entry."""
-    assert old in bench.text
-    return parse_bench(bench.text.replace(old, new), "changed")
 
 
 @pytest.mark.parametrize("name", sorted(IN_LOOP.keys() - NOT_PLAYED))
