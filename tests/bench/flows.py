@@ -95,20 +95,23 @@ class Events(NamedTuple):
     reversed: int
     stuck: int
     released: int
-    contact_made: int
     contact_left: int
+    saturated: int  # Hysteresis, or play
+    contact_made: int
 
 
-def events(states: Floats) -> Events:
-    """Count what happened between the samples."""
-    directions, sides = np.sign(states[:, 1]), states[:, 0] > 0.0
+def events(states: Floats, m: Mechanics = EXACT) -> Events:
+    """Count what happened between the samples; states of angle and velocity alone saturate nothing."""
+    directions, sides = np.sign(states[:, 1]), states[:, 0] > (states[:, 2] if m.play else 0.0)
+    full = (np.abs(states[:, 2:3]) == (0.5 * m.play or 1.0)).any(axis=1)
     before, after, was_in, is_in = directions[:-1], directions[1:], sides[:-1], sides[1:]
     return Events(
         reversed=int((before * after < 0.0).sum()),
         stuck=int(((before != 0.0) & (after == 0.0)).sum()),
         released=int(((before == 0.0) & (after != 0.0)).sum()),
-        contact_made=int((was_in < is_in).sum()),
         contact_left=int((was_in > is_in).sum()),
+        saturated=int((full[1:] > full[:-1]).sum()),
+        contact_made=int((was_in < is_in).sum()),
     )
 
 

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from emb_bench.compiled import compiled
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import Mechanics
 from emb_runtime.config.bench import BrakeParameters
-from tests.bench.flows import difference, whole
+from tests.bench.flows import Events, difference, events, whole
 
 BENCH = load_bench()
 P = BENCH.brake
@@ -84,27 +83,6 @@ def compare(m: Mechanics, currents: Floats, x0: tuple[float, float]) -> tuple[in
     return made, len(names) - made
 
 
-class Events(NamedTuple):
-    reversed: int
-    stuck: int
-    released: int
-    contact_left: int
-    saturated: int
-
-
-def events(states: Floats, m: Mechanics = PLAIN) -> Events:
-    """What shows in the samples."""
-    v, clamp = states[:, 1], states[:, 0] - (states[:, 2] if m.play else 0.0)
-    touching, saturated = clamp > 0.0, np.abs(states[:, 2]) == (0.5 * m.play or 1.0)
-    return Events(
-        int((v[1:] * v[:-1] < 0.0).sum()),
-        int(((v[1:] == 0.0) & (v[:-1] != 0.0)).sum()),
-        int(((v[1:] != 0.0) & (v[:-1] == 0.0)).sum()),
-        int((touching[1:] < touching[:-1]).sum()),
-        int((saturated[1:] > saturated[:-1]).sum()),
-    )
-
-
 def drawn(rng: np.random.Generator) -> tuple[Floats, tuple[float, float]]:
     """Currents that reverse, stop, hold and release the brake and let it leave contact; and a start."""
     levels = rng.uniform(-3.0, 3.0, 12) * rng.choice([0.3, 1.0])
@@ -115,7 +93,7 @@ def drawn(rng: np.random.Generator) -> tuple[Floats, tuple[float, float]]:
 @pytest.mark.parametrize("name", PLANTS)
 def test_sensitivities_are_the_finite_differences_of_the_flow(name: str) -> None:
     m, rng = PLANTS[name], np.random.default_rng(5)
-    counts, seen = np.zeros(2, int), np.zeros(5, int)
+    counts, seen = np.zeros(2, int), np.zeros(6, int)
     for _ in range(24):
         currents, x0 = drawn(rng)
         counts += compare(m, currents, x0)
@@ -276,7 +254,7 @@ def slid(m: Mechanics, t: float, y: Floats, i: float, u: float) -> tuple[float, 
 
 @pytest.mark.parametrize("name", PLANTS)
 def test_the_motion_is_that_of_a_general_solver_with_events(name: str) -> None:
-    m, rng, seen = PLANTS[name], np.random.default_rng(5), np.zeros(5, int)
+    m, rng, seen = PLANTS[name], np.random.default_rng(5), np.zeros(6, int)
     for _ in range(6):
         currents, x0 = drawn(rng)
         found, expected = run(m, P, currents, x0)[0], solved(m, currents, x0)
