@@ -151,19 +151,28 @@ def test_nothing_of_this_machine_is_in_the_file_and_it_is_the_same_each_time(
 
 
 @pytest.fixture(scope="module")
-def speeds(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("speeds")
-    assert train_main(["ppo", "--output", str(folder / "run"), "--bench", str(short_bench(folder))]) == 0
-    return folder / "run"
+def speeds(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Trained]:
+    """The folder of a training, and the actor that it has found."""
+    folder, kept = tmp_path_factory.mktemp("speeds"), list[Trained]()
+
+    def keeping(*arguments: Any) -> Iterator[Trained]:
+        for best in run_training(*arguments):
+            kept.append(best)
+            yield best
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("emb_train.training.run_training", keeping)
+        assert train_main(["ppo", "--output", str(folder / "run"), "--bench", str(short_bench(folder))]) == 0
+    return folder / "run", kept[-1]
 
 
 def test_a_training_for_speeds_gives_target_speeds_of_the_estimate_which_the_runtime_follows(
-    speeds: Path, tmp_path: Path
+    speeds: tuple[Path, Trained],
 ) -> None:
-    bench, training = load_bench(speeds / BENCH_FILE), load_preset("interval")
-    *_, best = run_training(tmp_path, training, bench)
+    folder, best = speeds
+    bench, training = load_bench(folder / BENCH_FILE), load_preset("interval")
     data, said = network_file(best, training, bench)
-    assert data == (speeds / "actor.onnx").read_bytes()
+    assert data == (folder / "actor.onnx").read_bytes()
     assert "the trained network" in said
     policy = load_policy(data, bench)
     contract = policy.contract
@@ -236,10 +245,10 @@ def test_a_design_is_exported_as_a_policy(tmp_path: Path) -> None:
 
 
 def test_each_graph_stands_alone_in_a_version_that_the_runtimes_oldest_library_reads(
-    exported: bytes, speeds: Path, tmp_path: Path
+    exported: bytes, speeds: tuple[Path, Trained], tmp_path: Path
 ) -> None:
     assert main(["step", "--output", str(tmp_path / "step.onnx")]) == 0
-    for data in (exported, (speeds / "actor.onnx").read_bytes(), (tmp_path / "step.onnx").read_bytes()):
+    for data in (exported, (speeds[0] / "actor.onnx").read_bytes(), (tmp_path / "step.onnx").read_bytes()):
         model = onnx.load_from_string(data)
         onnx.checker.check_model(model, full_check=True)
         assert [(o.domain, o.version) for o in model.opset_import] == [("", 20)]

@@ -42,15 +42,13 @@ def fields(mapping: Mapping | str) -> object:
 
 
 def test_a_dbc_that_is_cut_off_is_refused_wherever_a_statement_is_not_whole() -> None:
-    whole = fields(read(DBC))
-    for dbc in (DBC, DBC + OTHERS):
-        cut_in_statement = 0
-        for length in range(len(dbc)):
-            found = read(dbc[:length])
-            cut_in_statement += isinstance(found, str)
-            if dbc[:length].rstrip()[-1:] not in (";", "") and "SIG_VALTYPE_" in dbc[:length]:
-                assert isinstance(found, str) or fields(found) == whole, dbc[length - 40 : length]
-        assert cut_in_statement > 0.9 * len(DBC)
+    whole, dbc, refused = fields(read(DBC)), DBC + OTHERS, 0
+    for length in range(len(dbc)):
+        found = read(dbc[:length])
+        refused += isinstance(found, str)
+        if dbc[:length].rstrip()[-1:] not in (";", "") and "SIG_VALTYPE_" in dbc[:length]:
+            assert isinstance(found, str) or fields(found) == whole, dbc[length - 40 : length]
+    assert refused > 0.9 * len(DBC)
 
 
 @pytest.mark.parametrize("identifier", [1 << 32, (1 << 32) + 14, 1 << 33, 9_999_999_999])
@@ -63,7 +61,7 @@ def test_an_identifier_of_more_than_32_bits_is_no_other_one(identifier: int) -> 
 
 def test_a_dbc_with_bytes_changed_is_read_or_refused_in_one_line() -> None:
     junk = ["", "e999", "9" * 5000, "\0", "\u202e", "m1M", "SG_ ", "BO_ ", "\n", *'90-|:"\\; ']
-    for seed in range(1500):
+    for seed in range(600):
         draw, text = random.Random(seed), DBC + OTHERS
         for _ in range(draw.choice((1, 1, 2, 8))):
             at = draw.randrange(len(text))

@@ -110,13 +110,12 @@ def test_emb_run_refuses_another_wish_in_one_line(installed: Path) -> None:
 
 
 def test_a_core_that_differs_in_one_bit_is_found_by_the_comparison(installed: Path) -> None:
+    """That one that does not differ passes is what ``make compiled`` runs."""
     text = SOURCE.read_text()
     changed = text.replace("max(requested, -limits.current)", "max(requested, -limits.current * (1.0 + 2.0**-52))")
     assert changed != text
-    for content, code, said in ((text, 0, "1 passed"), (changed, 1, "of 1000 differ")):
-        add_core(installed, content)
-        options = ("-p", "no:cacheprovider", "--inputs", "1000", "-k", "limits")
-        done = run(installed, "-m", "pytest", "tests/compiled", *options)
-        assert done.returncode == code, done.stdout + done.stderr
-        assert said in done.stdout
-        shutil.rmtree(installed / "emb_runtime" / "native")
+    add_core(installed, changed)
+    options = ("-p", "no:cacheprovider", "--inputs", "1000", "-k", "limits")
+    done = run(installed, "-m", "pytest", "tests/compiled", *options)
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "of 1000 differ" in done.stdout

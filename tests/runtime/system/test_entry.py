@@ -52,10 +52,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path
         ("emb_runtime.system.entry:emb-gateway", "run.mcap --drive a --node b", (-2,)),
         ("emb_bench.cli.entry:emb-node", "--iface no0", (-2, 0, 4)),
         ("emb_bench.cli.entry:emb-replay", "info run.mcap", (-2, 130)),
-        ("emb_bench.cli.entry:emb-replay", "fim run.mcap", (-2, 130)),
+        pytest.param("emb_bench.cli.entry:emb-replay", "fim run.mcap", (-2, 130), marks=pytest.mark.slow),
         ("emb_bench.cli.entry:emb-replay", "estimate run.mcap --starts 1", (-2, 130)),
         ("emb_bench.cli.entry:emb-replay", "export run.mcap -o run.png", (-2, 130)),
-        ("emb_bench.cli.entry:emb-replay", "rerun run.mcap", (-2, 130)),
+        pytest.param("emb_bench.cli.entry:emb-replay", "rerun run.mcap", (-2, 130), marks=pytest.mark.slow),
         ("emb_bench.cli.entry:emb-design", "--starts 0", (-2, 130)),
         ("emb_bench.cli.entry:emb-commission", "--iface sim:seed=x new", (-2, 130)),
         ("emb_bench.cli.entry:emb-hil", "--host -- true", (-2, 130)),
@@ -65,17 +65,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path
 )
 def test_ctrl_c_at_any_import_is_no_traceback(folder: Path, command: str, words: str, ends: tuple[int, ...]) -> None:
     module, name = command.split(":")
-    codes = folder / f"codes-{os.urandom(4).hex()}"
-    arguments = [
-        module,
-        name.replace("-", "_"),
-        str(STEP if name != "emb-train" else 12 * STEP),
-        str(codes),
-        name,
-        *words.split(),
-    ]
+    codes, step = folder / f"codes-{os.urandom(4).hex()}", STEP if name != "emb-train" else 12 * STEP
+    words_of_it = [module, name.replace("-", "_"), str(step), str(codes), name, *words.split()]
     done = subprocess.run(
-        [sys.executable, "-c", PRESSED, *arguments], cwd=folder, capture_output=True, text=True, check=False
+        [sys.executable, "-c", PRESSED, *words_of_it], cwd=folder, capture_output=True, text=True, check=False
     )
     assert "Traceback" not in done.stderr
     assert "Exception ignored" not in done.stderr
