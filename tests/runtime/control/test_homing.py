@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -32,6 +31,11 @@ INSIDE = st.tuples(*(st.floats(getattr(BOX.low, name), getattr(BOX.high, name)) 
 
 
 GoHome = Callable[..., SimRun]
+ENDED = Outcome(
+    fault=None, detail="", counters=RunCounters(), end=None, last=None, home=False, node_at_rest=True,
+    node_stop_reason=StopReason.DISABLED, duration_ns=0, rejections={}, bus_errors={},
+)  # fmt: skip
+"""Of an experiment that ended as it should."""
 
 
 @pytest.fixture(scope="session")
@@ -127,24 +131,14 @@ def test_a_brake_that_does_not_move_is_given_up(go_home: GoHome) -> None:
     assert run.transport.node.angle == pytest.approx(1.0, abs=0.2)
 
 
-@pytest.fixture
-def ended() -> Outcome:
-    return Outcome(**_anything(), fault=None, node_at_rest=True, node_stop_reason=StopReason.DISABLED)
-
-
-def _anything() -> dict[str, Any]:
-    none: dict[str, Any] = {"end": None, "last": None, "duration_ns": 0, "rejections": {}, "bus_errors": {}}
-    return {**none, "detail": "", "counters": RunCounters(), "home": False}
-
-
-def test_nothing_moves_by_itself_after_a_fault_that_casts_doubt_on_brake_drive_or_bus(ended: Outcome) -> None:
-    assert may_go_home(ended)
-    assert {fault for fault in Fault if may_go_home(replace(ended, fault=fault))} == TRUSTED_AFTER
+def test_nothing_moves_by_itself_after_a_fault_that_casts_doubt_on_brake_drive_or_bus() -> None:
+    assert may_go_home(ENDED)
+    assert {fault for fault in Fault if may_go_home(replace(ENDED, fault=fault))} == TRUSTED_AFTER
     for doubtful in (Fault.OUT_OF_LIMITS, Fault.CURRENT_MISMATCH, Fault.FOREIGN_COMMAND, Fault.BUS_LOST):
         assert doubtful not in TRUSTED_AFTER
     assert Fault.INTERRUPTED not in TRUSTED_AFTER
 
 
-def test_after_the_brake_has_reached_a_limit_nothing_moves_by_itself(ended: Outcome) -> None:
+def test_after_the_brake_has_reached_a_limit_nothing_moves_by_itself() -> None:
     for fault in (None, *TRUSTED_AFTER):
-        assert not may_go_home(replace(ended, fault=fault, node_stop_reason=StopReason.LIMIT))
+        assert not may_go_home(replace(ENDED, fault=fault, node_stop_reason=StopReason.LIMIT))
