@@ -203,23 +203,21 @@ class ZstdError(Exception):
 
 
 @pytest.mark.parametrize("kind", [OSError, ZstdError, MemoryError, ValueError, UnicodeError, KeyError, RecursionError])
-@pytest.mark.parametrize("place", ["add_message", "flush", "finish", "add_metadata"])
-def test_whatever_writing_raises_the_run_is_told(
-    kind: type[Exception], place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ring = Ring.create(16)
-    header = to_builtins(HEADER, str_keys=True)
-    recording = recorder_process.begin_recording(
-        ring, {"path": str(tmp_path / "run.mcap"), "parent": 0, "header": header}
-    )
-
+def test_whatever_writing_raises_the_run_is_told(kind: type[Exception], tmp_path: Path) -> None:
     def fail(*_: object, **__: object) -> None:
         raise kind("planted")
 
-    monkeypatch.setattr(Writer, place, fail)
-    ring.push(*pack(EventRecord(START, "X", "")))
-    answer = recording.finish({"exit_reason": "done"})
-    assert answer["error"] == f"writing failed: {kind.__name__}: {kind('planted')}"
+    header = to_builtins(HEADER, str_keys=True)
+    for place in ("add_message", "flush", "finish", "add_metadata"):
+        ring = Ring.create(16)
+        recording = recorder_process.begin_recording(
+            ring, {"path": str(tmp_path / f"{place}.mcap"), "parent": 0, "header": header}
+        )
+        ring.push(*pack(EventRecord(START, "X", "")))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Writer, place, fail)
+            answer = recording.finish({"exit_reason": "done"})
+        assert answer["error"] == f"writing failed: {kind.__name__}: {kind('planted')}", place
 
 
 def test_what_the_first_chunk_raises_is_told_before_the_run_and_no_file_stays(
