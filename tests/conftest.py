@@ -42,9 +42,6 @@ settings.register_profile(
 settings.register_profile("patient", settings.get_profile("searching"), derandomize=True)
 settings.load_profile("patient")
 
-FIXTURE_KEPT = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
-"""For ``suppress_health_check``, where all examples share what a fixture made: it replaces the profile's."""
-
 # A shell starts what it puts into the background with Ctrl-C ignored, and every child inherits that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -122,6 +122,10 @@ def test_memory_that_is_no_heartbeat_is_refused(memory: bytes) -> None:
 # --- the judgement of a silence -------------------------------------------------------------------------------------
 
 
+def monitor() -> SilenceMonitor:
+    return SilenceMonitor(HEARTBEAT, START)
+
+
 def looks(watch: SilenceMonitor, *times_ns: int, beat_ns: int) -> LoopStatus:
     """The verdict at the last of these times; it was ALIVE at all others."""
     for time_ns in times_ns[:-1]:
@@ -133,14 +137,12 @@ ON_SCHEDULE = [START + k * MS for k in range(1, 5)]
 
 
 def test_a_silence_of_the_heartbeat_trips_and_one_nanosecond_less_does_not() -> None:
-    assert (
-        looks(SilenceMonitor(HEARTBEAT, START), *ON_SCHEDULE, START + HEARTBEAT - 1, beat_ns=START) is LoopStatus.ALIVE
-    )
-    assert looks(SilenceMonitor(HEARTBEAT, START), *ON_SCHEDULE, START + HEARTBEAT, beat_ns=START) is LoopStatus.STALLED
+    assert looks(monitor(), *ON_SCHEDULE, START + HEARTBEAT - 1, beat_ns=START) is LoopStatus.ALIVE
+    assert looks(monitor(), *ON_SCHEDULE, START + HEARTBEAT, beat_ns=START) is LoopStatus.STALLED
 
 
 def test_whoever_is_not_armed_may_be_silent_and_is_judged_from_the_arming_on() -> None:
-    watch = SilenceMonitor(HEARTBEAT, START)
+    watch = monitor()
     for k in range(1, 100):
         assert watch.look(START + k * MS, START, armed=False, gone=False) is LoopStatus.ALIVE
     last = START + 99 * MS
@@ -151,30 +153,24 @@ def test_whoever_is_not_armed_may_be_silent_and_is_judged_from_the_arming_on() -
 
 
 def test_a_beat_from_the_future_is_none() -> None:
-    assert SilenceMonitor(HEARTBEAT, START).look(START, START, armed=True, gone=False) is LoopStatus.ALIVE
-    assert SilenceMonitor(HEARTBEAT, START).look(START, START + 1, armed=True, gone=False) is LoopStatus.STALLED
+    assert monitor().look(START, START, armed=True, gone=False) is LoopStatus.ALIVE
+    assert monitor().look(START, START + 1, armed=True, gone=False) is LoopStatus.STALLED
 
 
 @pytest.mark.parametrize(("armed", "status"), [(True, LoopStatus.GONE), (False, LoopStatus.OVER)])
 def test_a_loop_that_is_gone_was_to_be_watched_or_had_ended(armed: bool, status: LoopStatus) -> None:
-    assert SilenceMonitor(HEARTBEAT, START).look(START, START, armed, gone=True) is status
+    assert monitor().look(START, START, armed, gone=True) is status
 
 
 def test_two_intervals_between_two_looks_are_on_schedule_and_more_is_stolen() -> None:
     two = START + 2 * MS
-    assert (
-        looks(SilenceMonitor(HEARTBEAT, START), two, two + 2 * MS, START + HEARTBEAT, beat_ns=START)
-        is LoopStatus.STALLED
-    )
-    assert (
-        looks(SilenceMonitor(HEARTBEAT, START), two + 1, two + 2 * MS, START + HEARTBEAT, beat_ns=START)
-        is LoopStatus.ALIVE
-    )
+    assert looks(monitor(), two, two + 2 * MS, START + HEARTBEAT, beat_ns=START) is LoopStatus.STALLED
+    assert looks(monitor(), two + 1, two + 2 * MS, START + HEARTBEAT, beat_ns=START) is LoopStatus.ALIVE
 
 
 def test_what_was_stolen_is_not_held_against_the_loop_beyond_one_interval() -> None:
     beat = START + MS
-    watch = SilenceMonitor(HEARTBEAT, START)
+    watch = monitor()
     # On schedule at 1 and 2 ms, then nothing until 6.5 ms: 3.5 of those 4.5 ms were stolen.
     assert looks(watch, beat, beat + MS, beat + 5 * MS + MS // 2, beat_ns=beat) is LoopStatus.ALIVE
     assert looks(watch, beat + 7 * MS, beat + 8 * MS + MS // 2 - 1, beat_ns=beat) is LoopStatus.ALIVE
@@ -182,7 +178,7 @@ def test_what_was_stolen_is_not_held_against_the_loop_beyond_one_interval() -> N
 
 
 def test_a_theft_before_the_beat_excuses_nothing_after_it() -> None:
-    watch = SilenceMonitor(HEARTBEAT, START)
+    watch = monitor()
     wake = START + 40 * MS
     beat = wake - MS // 2
     assert looks(watch, wake, beat_ns=beat) is LoopStatus.ALIVE  # half a millisecond of this silence was stolen
@@ -190,7 +186,7 @@ def test_a_theft_before_the_beat_excuses_nothing_after_it() -> None:
     assert looks(watch, *rest, beat + HEARTBEAT + MS // 2 - 1, beat_ns=beat) is LoopStatus.ALIVE
     assert looks(watch, beat + HEARTBEAT + MS // 2, beat_ns=beat) is LoopStatus.STALLED
     # The next beat starts with nothing excused.
-    again = SilenceMonitor(HEARTBEAT, START)
+    again = monitor()
     looks(again, wake, beat_ns=beat)
     later = wake + MS
     assert looks(again, later, *[later + k * MS for k in range(1, 5)], later + HEARTBEAT, beat_ns=later) is (
@@ -199,11 +195,11 @@ def test_a_theft_before_the_beat_excuses_nothing_after_it() -> None:
 
 
 def test_no_theft_excuses_a_silence_of_two_heartbeats() -> None:
-    assert looks(SilenceMonitor(HEARTBEAT, START), START + 2 * HEARTBEAT - 1, beat_ns=START) is LoopStatus.ALIVE
-    assert looks(SilenceMonitor(HEARTBEAT, START), START + 2 * HEARTBEAT, beat_ns=START) is LoopStatus.STALLED
+    assert looks(monitor(), START + 2 * HEARTBEAT - 1, beat_ns=START) is LoopStatus.ALIVE
+    assert looks(monitor(), START + 2 * HEARTBEAT, beat_ns=START) is LoopStatus.STALLED
     # Not even where every single look is late.
     late = [START + k * 5 * MS // 2 for k in range(1, 4)]
-    assert looks(SilenceMonitor(HEARTBEAT, START), *late, START + 2 * HEARTBEAT, beat_ns=START) is LoopStatus.STALLED
+    assert looks(monitor(), *late, START + 2 * HEARTBEAT, beat_ns=START) is LoopStatus.STALLED
 
 
 @settings(deadline=None)
@@ -211,7 +207,7 @@ def test_no_theft_excuses_a_silence_of_two_heartbeats() -> None:
 def test_it_trips_between_one_and_two_heartbeats_of_silence_and_on_schedule_after_one(
     steps: list[tuple[int, bool]],
 ) -> None:
-    watch = SilenceMonitor(HEARTBEAT, START)
+    watch = monitor()
     now = beat = START
     on_schedule = True  # since the last beat
     for gap, beats in steps:
