@@ -1,8 +1,8 @@
 """Faults, and what may come of each: one table, played wherever a row says how.
 
 In the simulated loop (``tests/runtime/control/test_faults.py``), from the record of that run again
-(``tests/runtime/control/test_inputs.py``, ``tests/bench/test_rerun.py``), and against emb-run and emb-node as shipped
-on a real bus (``tests/hil``). What a node may lie about is in :mod:`tests.scenarios.lies`.
+(``tests/bench/test_rerun.py``), and against emb-run and emb-node as shipped on a real bus (``tests/hil``). What a node
+may lie about is in :mod:`tests.scenarios.lies`.
 """
 
 from __future__ import annotations

@@ -1,108 +1,20 @@
-"""Inputs in the journal of a run: fed to a core of the same setup, they make every record of the run again."""
+"""Inputs in the journal of a run: what the driver did, call by call.
+
+That they make every record of the run again is shown from the log of each fault by ``tests/bench/test_rerun.py``.
+"""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterable
 from typing import Any
 
-import pytest
-
-from emb_runtime.can.transport import TransmitQueueFullError
-from emb_runtime.control.core import Core
-from emb_runtime.log.ring_buffer import FrameRecord, InputRecord, Record
+from emb_runtime.log.ring_buffer import FrameRecord, InputRecord
 from emb_runtime.records import Call, Frame
-from emb_runtime.safety.state_machine import Fault
 
 from tests.conftest import FunctionActor, Journal, Simulate, make_loop  # isort: skip
-from tests.benches import SENSOR_BENCH
 from tests.scenarios.injections import Pulse
-from tests.scenarios.table import IN_LOOP, loop_run
+from tests.scenarios.table import loop_run
 
 STEPS = 200
-
-
-def records_of(core: Core, inputs: Iterable[Record], lost: list[str]) -> list[Record]:
-    """Records of a core that gets these inputs; ``lost`` holds why the bus has no room for the next frame."""
-    frames, found = list[Frame](), list[Record]()
-    for record in inputs:
-        if isinstance(record, FrameRecord):
-            frames.append(record.frame)
-            if record.read_ns:
-                take(core, frames, record.read_ns)
-                frames = []
-        elif isinstance(record, InputRecord):
-            call(core, record, lost)
-        found += core.records
-        core.records.clear()
-    return found
-
-
-def take(core: Core, frames: list[Frame], read_ns: int) -> None:
-    with contextlib.suppress(ZeroDivisionError):  # of the actor
-        core.process_frames(frames, read_ns)
-
-
-def call(core: Core, record: InputRecord, lost: list[str]) -> None:
-    """Make a call of the driver again."""
-    time_ns, number, send_ns, code, text = record
-    match number:
-        case Call.BEGIN:
-            core.begin(time_ns)
-        case Call.TIMEOUT:
-            core.timeout(time_ns)
-        case Call.ANSWER:
-            frame = core.answer(time_ns)
-            if frame is not None and (send_ns or text):
-                lost[:] = [text] if text else []
-                try:
-                    core.guard.send(frame)
-                except TransmitQueueFullError:
-                    core.sent(time_ns, text)
-                else:
-                    core.sent(send_ns)
-        case Call.LATCH:
-            core.latch(Fault[code], time_ns)
-        case Call.EXPLAIN:
-            core.explain(Fault[code], time_ns, text)
-        case Call.STOP_FRAME:
-            core.stop_frame(time_ns)
-        case Call.NOTE:
-            core.note(time_ns, code, text)
-        case Call.END:
-            core.end(time_ns)
-        case _:
-            raise AssertionError(record)
-
-
-def assert_inputs_suffice(journal: Journal, law: Any, steps: int, on_bench: Any = SENSOR_BENCH, **core: Any) -> None:
-    lost: list[str] = []
-
-    def send(_frame: Frame) -> None:
-        if lost:
-            raise TransmitQueueFullError(lost.pop())
-
-    driven: dict[str, Any] = {"send": send, "receive": None, "now_ns": None, "push": None}
-    loop = make_loop(on_bench, FunctionActor(law), steps, **driven, **core)
-    inputs = [record for record in journal.records if isinstance(record, FrameRecord | InputRecord)]
-    again = records_of(loop.core, inputs, lost)
-    assert list(map(repr, again)) == list(map(repr, journal.records))  # repr, because NaN is not equal to NaN
-
-
-@pytest.mark.parametrize("name", sorted(IN_LOOP.keys() - {"unguarded"}))
-def test_the_inputs_of_a_run_make_each_of_its_records_again(name: str, simulate: Simulate) -> None:
-    given: dict[str, Any] = {}
-    journal = Journal()
-
-    def record(law: Any = lambda *_: 6.0, **arguments: Any) -> Any:
-        given.update(law=law, **arguments)
-        return simulate(law, journal=journal, **arguments)
-
-    run = loop_run(name, record)
-    fault = IN_LOOP[name].fault
-    assert fault is None or fault.name in run.journal.codes
-    core = {"homing": True} if given.get("homing") else {}
-    assert_inputs_suffice(journal, given["law"], given.get("steps", run.bench.timing.horizon), run.bench, **core)
 
 
 def test_what_the_driver_did_is_in_the_journal_call_by_call(simulate: Simulate) -> None:
@@ -140,9 +52,16 @@ def test_a_sample_is_answered_once_and_without_one_nothing_is(simulate: Simulate
     inputs = [record for record in journal.records if isinstance(record, FrameRecord | InputRecord)]
     at = next(n for n, r in enumerate(inputs) if isinstance(r, InputRecord) and r.call == Call.ANSWER)
     driven: dict[str, Any] = dict.fromkeys(("send", "receive", "now_ns", "push"))
-    core = make_loop(run.bench, FunctionActor(lambda *_: 3.0), STEPS, **driven).core
+    core, frames = make_loop(run.bench, FunctionActor(lambda *_: 3.0), STEPS, **driven).core, list[Frame]()
     assert core.answer(0) is None
-    records_of(core, inputs[:at], [])
+    for record in inputs[:at]:
+        if isinstance(record, InputRecord):
+            core.begin(record.time_ns)
+            continue
+        frames.append(record.frame)
+        if record.read_ns:
+            core.process_frames(frames, record.read_ns)
+            frames = []
     time_ns = inputs[at].time_ns
     assert core.answer(time_ns) is not None
     core.records.clear()
