@@ -76,7 +76,7 @@ def test_ctrl_c_at_any_import_is_no_traceback(folder: Path, command: str, words:
 
 
 LOST = """
-import os, signal
+import os, signal, time
 
 class Deaf:
     def __del__(self):
@@ -85,7 +85,7 @@ class Deaf:
 def main():
     Deaf()
     while True:
-        pass
+        time.sleep(0.001)
 """
 MISTAKEN = """
 import os, signal
