@@ -138,17 +138,10 @@ def record(opcode: int, body: bytes) -> bytes:
     return struct.pack("<BQ", opcode, len(body)) + body
 
 
-def chunk(
-    data: bytes,
-    *,
-    size: int | None = None,
-    crc: int | None = None,
-    packed: bytes | None = None,
-    compression: bytes = b"zstd",
-) -> bytes:
-    """The body of a chunk; it may claim another size or checksum than it has, or hold other bytes."""
+def chunk(data: bytes, *, size: int | None = None, packed: bytes | None = None, compression: bytes = b"zstd") -> bytes:
+    """The body of a chunk; it may claim another size than it has, or hold other bytes."""
     packed = zstandard.compress(data) if packed is None else packed
-    claimed = len(data) if size is None else size, zlib.crc32(data) if crc is None else crc
+    claimed = len(data) if size is None else size, zlib.crc32(data)
     name = struct.pack("<I", len(compression)) + compression
     return struct.pack("<QQQI", 0, 2**63, *claimed) + name + struct.pack("<Q", len(packed)) + packed
 

@@ -25,7 +25,7 @@ _TCMSG = struct.Struct("=B3xiIII")
 _ROOT = 0xFFFFFFFF
 _TCA_KIND, _TCA_OPTIONS = 1, 2
 _NETEM = struct.Struct("=6I")  # struct tc_netem_qopt: latency, limit, loss, gap, duplicate, jitter
-_NETEM_REORDER, _NETEM_LATENCY64, _NETEM_JITTER64 = 3, 10, 11
+_NETEM_REORDER, _NETEM_LATENCY64 = 3, 10
 
 _RTCANMSG = struct.Struct("=BBH")
 _GATEWAY, _ECHO = 1, 1
@@ -44,7 +44,6 @@ class Impairment:
     """Impairment of the frames that are sent on a bus; probabilities 0..1, of each frame for itself."""
 
     delay: float = 0.0  # s
-    jitter: float = 0.0  # s, up to which the delay departs from its value; frames may then overtake others
     loss: float = 0.0
     duplicate: float = 0.0
     reorder: float = 0.0  # of not being delayed, and so overtaking what waits; needs a delay
@@ -58,10 +57,8 @@ def impair(interface: str, impairment: Impairment) -> None:
     head = _NETEM.pack(
         0, impairment.limit, _share(impairment.loss), 1 if impairment.reorder else 0, _share(impairment.duplicate), 0
     )
-    options = (
-        attribute(_NETEM_LATENCY64, struct.pack("=q", round(impairment.delay * 1e9)))
-        + attribute(_NETEM_JITTER64, struct.pack("=q", round(impairment.jitter * 1e9)))
-        + attribute(_NETEM_REORDER, struct.pack("=II", _share(impairment.reorder), 0))
+    options = attribute(_NETEM_LATENCY64, struct.pack("=q", round(impairment.delay * 1e9))) + attribute(
+        _NETEM_REORDER, struct.pack("=II", _share(impairment.reorder), 0)
     )
     kind = attribute(_TCA_KIND, b"netem\0")
     _qdisc(_RTM_NEWQDISC, CREATE | REPLACE, interface, kind + attribute(_TCA_OPTIONS, head + options))

@@ -84,9 +84,9 @@ def crc(data_id: int, body: bytes) -> int:
     return register
 
 
-def frame(identifier: int, word: int, length: int = 8) -> Said:
+def frame(identifier: int, word: int) -> Said:
     """A frame from its payload as one number, little-endian, whose lowest byte is left to the CRC."""
-    body = word.to_bytes(length, "little")[1:]
+    body = word.to_bytes(8, "little")[1:]
     return identifier, bytes([crc(DATA_ID[identifier], body)]) + body
 
 
@@ -237,16 +237,10 @@ class LyingNode:
     def _move(self, current: float) -> None:
         stiffness = K_1 if self.began is None else self._lie.stiffness * K_1
         coulomb = T_C * (1.0 + self._lie.friction_rate * self._since())
-        for _ in range(STEPS):
-            left = 1e-3 / STEPS
-            while left > 0.0:  # Twice where the brake comes to rest within the step
-                left -= self._step(left, current, stiffness, coulomb)
+        self._slide(current, stiffness, coulomb)
         if self._lie.imagined != 1.0:
             true, (self.angle, self.velocity) = (self.angle, self.velocity), self._model
-            for _ in range(STEPS):
-                left = 1e-3 / STEPS
-                while left > 0.0:
-                    left -= self._step(left, current * self._lie.imagined, K_1, T_C)
+            self._slide(current * self._lie.imagined, K_1, T_C)
             self._model, (self.angle, self.velocity) = (self.angle, self.velocity), true
         self.lowest, self.highest = min(self.lowest, self.angle), max(self.highest, self.angle)
         self.fastest = max(self.fastest, abs(self.velocity))
@@ -260,6 +254,12 @@ class LyingNode:
             self._resting = self._resting + 1 if abs(self.velocity) < 0.5 else 0
             if self._resting >= 50:
                 self.state = IDLE
+
+    def _slide(self, current: float, stiffness: float, coulomb: float) -> None:
+        for _ in range(STEPS):
+            left = 1e-3 / STEPS
+            while left > 0.0:  # Twice where the brake comes to rest within the step
+                left -= self._step(left, current, stiffness, coulomb)
 
     def _step(self, step: float, current: float, stiffness: float, coulomb: float) -> float:
         """Move by the midpoint rule, up to the instant of rest if there is one; the time taken [s]."""
