@@ -38,8 +38,6 @@ from emb_runtime.policy.contract import (
 )
 from emb_runtime.policy.onnx_file import FIXED, MAX_PARTS, read_graph
 from emb_runtime.policy.policy import MAX_FILE_BYTES, load_policy, open_session, shipped_actor_path
-from emb_runtime.safety.command_limits import checked
-from emb_runtime.safety.state_machine import Fault, StopError
 from tests.actors import constant_actor, contract_for, parsed, with_contract
 from tests.runtime.operating import refusal
 
@@ -239,23 +237,6 @@ def test_the_speed_loop_takes_an_estimate_within_its_range_only() -> None:
         estimator.state = estimator.state._replace(mean=(10.0, 50.0, k_m, 1.0, 1.0, 1.0))
         found.append(policy.act(10.0, 50.0, 0.0, estimator))
     assert found[0] == found[1] != found[2]
-
-
-def test_a_speed_that_is_not_finite_or_beyond_its_contract_asks_for_a_current_that_is_so_too() -> None:
-    for output, fault in (
-        *((output, Fault.POLICY_NOT_FINITE) for output in (math.nan, math.inf, -math.inf)),
-        *((output, Fault.POLICY_BEYOND_CONTRACT) for output in (1e9, -3e38, 500.001, -500.001)),
-        *((output, None) for output in (500.0, -500.0, 0.0)),
-    ):
-        policy = load_policy(constant_actor(BENCH, 250.0, later=output, kind="speed"), BENCH)
-        assert abs(asked(policy, 0.0, 0.0, 99)) <= BENCH.limits.current
-        current = asked(policy, 0.0, 0.0, 100)
-        if fault is None:
-            assert checked(current, BENCH.limits.current) == current
-            continue
-        with pytest.raises(StopError) as stopped:
-            checked(current, BENCH.limits.current)
-        assert stopped.value.fault is fault, output
 
 
 def test_a_speed_of_an_estimate_that_is_not_finite_asks_for_a_current_that_is_not() -> None:
