@@ -53,7 +53,7 @@ def corner(bench: Bench, number: int) -> str:
 
 @pytest.mark.parametrize("plant", ["exact", "euler"])
 def test_an_end_by_the_operator_is_explained_by_nothing_else(simulate: Simulate, bench: Bench, plant: str) -> None:
-    for number, period in enumerate(range(5 if plant == "exact" else 15, 500, 20)):
+    for number, period in enumerate(range(5 if plant == "exact" else 15, 500, 30)):
         asked = iter([False] * 2 * period)
         options = f"plant={plant},{corner(bench, number)},seed={number + 1}"
         run = simulate(lambda *_: 6.0, options=options, stop_requested=lambda asked=asked: next(asked, True))
@@ -243,12 +243,13 @@ def test_the_outcome_names_class_and_place_of_an_error_in_the_program(simulate: 
     assert re.fullmatch(r"ZeroDivisionError: .* \(test_loop\.py, line \d+\)", run.outcome.detail)
 
 
-def test_a_node_of_another_bench_or_protocol_is_not_armed(simulate: Simulate, layout: Layout) -> None:
+def test_a_node_of_another_bench_or_protocol_is_not_armed(simulate: Simulate, bench: Bench) -> None:
     for changes, reason in (
         ({"BenchIdentity": 0x1234}, "another bench file"),
         ({"ProtocolVersion": 99}, "protocol 99"),
     ):
-        run = simulate(on_receive=changing(saying(**changes), STATUS))
+        hasty = replace(bench, watch=replace(bench.watch, start_timeout=0.5))
+        run = simulate(on_bench=hasty, on_receive=changing(saying(**changes), STATUS))
         assert run.outcome.fault is Fault.NODE_NOT_READY
         assert reason in run.outcome.detail
         assert run.sent == []

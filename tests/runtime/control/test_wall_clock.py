@@ -134,11 +134,13 @@ def at(tick: int, moment_ns: int) -> int:
     return BOOT_NS + (1 + tick) * PERIOD_NS + moment_ns
 
 
+@pytest.mark.parametrize("half", [0, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("when", TICKS)
-def test_no_step_of_the_wall_clock_ends_a_run(bench: Bench, when: str) -> None:
+def test_no_step_of_the_wall_clock_ends_a_run(bench: Bench, when: str, half: int) -> None:
+    """By every other size of step, in both directions; by those between at night."""
     end, unanswered, _ = run(bench)
     assert (end[0], unanswered) == (None, 0)
-    for number, step_ns in enumerate(SWEEP_NS):
+    for number, step_ns in enumerate(sign * step for step in SWEEP[half::2] for sign in (1, -1)):
         for moment_ns in MOMENTS_NS[number // 2 % 3 :: 3]:
             stepped, lost, journal = run(bench, Step(at(TICKS[when], moment_ns), step_ns))
             row = f"{step_ns / 1e6} ms, {moment_ns / 1e6} ms after the tick: {journal.codes}"
