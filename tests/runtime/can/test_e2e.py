@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from emb_runtime.can.e2e import (
     COUNTER_MODULUS,
     NO_COUNTER,
+    WEIGHT,
     CounterCheck,
     LeakyCount,
     crc,
@@ -69,6 +70,15 @@ def test_the_error_count_leaks_saturates_and_follows_its_law(tolerated: int, eve
         else:
             last, errors = event, max(errors - 1, 0)
         assert (counter_check.last, counter_check.errors) == (last, errors)
+
+
+def test_four_good_frames_forgive_one_bad_one() -> None:
+    counter_check = CounterCheck(5)
+    counter_check.reject()
+    for counter in range(4):
+        assert counter_check.errors == WEIGHT - counter
+        counter_check.advance(counter)
+    assert counter_check.errors == 0
 
 
 @given(st.integers(1, 20), st.lists(st.booleans()))
