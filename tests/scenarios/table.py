@@ -18,31 +18,8 @@ from emb_runtime.records import NodeState
 from emb_runtime.safety.state_machine import FAULTS, Fault
 from tests.conftest import SimRun, Simulate
 from tests.drives import SHIPPED
-from tests.scenarios.injections import (
-    ANGLE,
-    COMMAND,
-    STATUS,
-    VELOCITY,
-    Pulse,
-    an_error_before_the_guard,
-    asked_often,
-    at_period,
-    away,
-    changing,
-    deafen,
-    drift,
-    dropping,
-    failing,
-    intruding,
-    later,
-    moved_unseen,
-    nothing,
-    reported,
-    saying,
-    shortened,
-    stop,
-    turned_out,
-)
+from tests.scenarios import injections as by
+from tests.scenarios.injections import ANGLE, COMMAND, STATUS, VELOCITY, Pulse
 
 Action = dict[str, Any]  # Done in the kernel by the method of tests.hil.stage that ``do`` names
 KILLED = -9
@@ -130,7 +107,7 @@ SCENARIOS = (
     # Where the simulated loop and the programs on a bus meet the same.
     Scenario("normal", "nothing", ("done",), lambda run: run(), (), stops=False),
     Scenario(
-        "interrupted", "Ctrl-C", ("INTERRUPTED",), lambda run: run(stop_requested=asked_often(700)),
+        "interrupted", "Ctrl-C", ("INTERRUPTED",), lambda run: run(stop_requested=by.asked_often(700)),
         (_signal("run", "SIGINT", WHEN),),
     ),
     Scenario(
@@ -144,15 +121,15 @@ SCENARIOS = (
     ),
     Scenario(
         "corrupted_sensor", "every velocity frame is damaged", ("FRAMES_REJECTED",),
-        lambda run: run(on_receive=changing(shortened, VELOCITY, range(100, 110))),
+        lambda run: run(on_receive=by.changing(by.shortened, VELOCITY, range(100, 110))),
         (_corrupt(VELOCITY),), JOINED, "vcan1",
     ),
     Scenario(
-        "foreign_commander", "somebody else commands", ("FOREIGN_COMMAND",), lambda run: run(on_receive=intruding()),
+        "foreign_commander", "somebody else commands", ("FOREIGN_COMMAND",), lambda run: run(on_receive=by.intruding()),
         ({"do": "command", "after": WHEN},), stop_frames=None,
     ),
     Scenario(
-        "link_down", "the interface is down", ("BUS_LOST",), lambda run: run(on_send=failing(BusError, 99)),
+        "link_down", "the interface is down", ("BUS_LOST",), lambda run: run(on_send=by.failing(BusError, 99)),
         (_link("vcan0", up=False, after=WHEN), _link("vcan0", up=True, pause=0.05)), node_lost=True, stop_frames=None,
     ),
     Scenario(
@@ -160,21 +137,21 @@ SCENARIOS = (
         lambda run: run(lambda _a, _v, k: 1e9 if k == 120 else 4.0), (), policy="giant", stops=False,
     ),
     # In the simulated loop: one for each other fault.
-    Scenario("no_node", "nothing is heard", ("NO_NODE",), lambda run: run(on_receive=nothing)),
+    Scenario("no_node", "nothing is heard", ("NO_NODE",), lambda run: run(on_receive=by.nothing)),
     Scenario(
         "moved_before", "the brake is not in its origin", ("NODE_NOT_READY",),
-        lambda run: run(on_receive=moved_unseen(away)),
+        lambda run: run(on_receive=by.moved_unseen(by.away)),
     ),
     Scenario(
         "angle_lost", "no angle comes any more", ("SENSOR_LOST",),
-        lambda run: run(on_receive=dropping(ANGLE, range(100, 10_000))),
+        lambda run: run(on_receive=by.dropping(ANGLE, range(100, 10_000))),
     ),
     Scenario(
         "turned_out", "a hand turns the brake out of its limits as the way home begins", ("OUT_OF_LIMITS",),
-        lambda run: run(homing=True, angle=-9.95, on_receive=turned_out),
+        lambda run: run(homing=True, angle=-9.95, on_receive=by.turned_out),
     ),
     Scenario(
-        "drift", "the angle drifts beside the velocity", ("SENSORS_CONTRADICT",), lambda run: run(on_receive=drift),
+        "drift", "the angle drifts beside the velocity", ("SENSORS_CONTRADICT",), lambda run: run(on_receive=by.drift),
     ),
     Scenario(
         "another_brake", "a brake outside the set", ("MOTION_OUTSIDE_SET",),
@@ -182,21 +159,22 @@ SCENARIOS = (
     ),
     Scenario(
         "polarity", "both sensors have the wrong sign", ("WRONG_POLARITY",),
-        lambda run: run(on_receive=changing(saying(Angle=lambda x: -x, Velocity=lambda v: -v))),
+        lambda run: run(on_receive=by.changing(by.saying(Angle=lambda x: -x, Velocity=lambda v: -v))),
     ),
     Scenario(
-        "node_stops", "the node stops by itself", ("NODE_STOPPED",), lambda run: run(on_receive=at_period(200, stop)),
+        "node_stops", "the node stops by itself", ("NODE_STOPPED",),
+        lambda run: run(on_receive=by.at_period(200, by.stop)),
     ),
-    Scenario("deaf", "the node hears nothing", ("NOT_OBEYED",), lambda run: run(on_receive=deafen)),
+    Scenario("deaf", "the node hears nothing", ("NOT_OBEYED",), lambda run: run(on_receive=by.deafen)),
     Scenario(
         "not_a_number", "the policy answers no number", ("POLICY_NOT_FINITE",),
         lambda run: run(lambda _a, _v, k: math.nan if k == 120 else 4.0),
     ),
-    Scenario("unguarded", "an error before the guard", ("GUARD_REJECTED",), an_error_before_the_guard),
+    Scenario("unguarded", "an error before the guard", ("GUARD_REJECTED",), by.an_error_before_the_guard),
     Scenario("program", "an error of the program", ("INTERNAL",), lambda run: run(lambda _a, _v, k: 1.0 / (k - 150.0))),
     Scenario(
         "current", "the drive reports another current", ("CURRENT_MISMATCH",),
-        lambda run: run(lambda *_: 3.0, on_receive=later(VELOCITY, 200, AppliedCurrent=0.5)),
+        lambda run: run(lambda *_: 3.0, on_receive=by.later(VELOCITY, 200, AppliedCurrent=0.5)),
     ),
     Scenario(
         "not_home", "the way home is too long for its time", ("NOT_HOME",),
@@ -204,47 +182,47 @@ SCENARIOS = (
     ),
     Scenario(
         "clock_jumps", "the node's clock jumps", ("DEVICE_TIME",),
-        lambda run: run(on_receive=later(ANGLE, 200, DeviceTime=lambda time: time + 0.5)),
+        lambda run: run(on_receive=by.later(ANGLE, 200, DeviceTime=lambda time: time + 0.5)),
     ),
     Scenario(
         "incomplete", "a fifth of the angles is lost", ("INCOMPLETE",),
-        lambda run: run(on_receive=dropping(ANGLE, MISSING_21_PERCENT)),
+        lambda run: run(on_receive=by.dropping(ANGLE, MISSING_21_PERCENT)),
     ),
     Scenario(
         "exchanged", "the node is for another bench", ("NODE_CHANGED",),
-        lambda run: run(on_receive=later(STATUS, 200, BenchIdentity=lambda number: int(number) ^ 1)),
+        lambda run: run(on_receive=by.later(STATUS, 200, BenchIdentity=lambda number: int(number) ^ 1)),
     ),
     Scenario(
         "unexplained", "a current that no brake explains", ("MOTION_UNEXPLAINED",),
         lambda run: run(
             lambda _x, _v, step: 6.0 if step // 60 % 2 == 0 else -6.0,
-            on_receive=later(VELOCITY, 0, AppliedCurrent=lambda current: current + 0.4),
+            on_receive=by.later(VELOCITY, 0, AppliedCurrent=lambda current: current + 0.4),
         ),
     ),
     Scenario("lag", "an undeclared lag", ("RESPONSE_LATE",), lambda run: run(options="plant=lag")),
     Scenario(
         "restless", "the node does not come to rest", ("NOT_AT_REST",),
-        lambda run: run(on_receive=later(VELOCITY, 520, NodeState=NodeState.FAULT)),
+        lambda run: run(on_receive=by.later(VELOCITY, 520, NodeState=NodeState.FAULT)),
     ),
     Scenario(
         "velocities_lost", "six velocities are lost", ("SENSOR_LATE",),
-        lambda run: run(on_receive=dropping(VELOCITY, range(100, 106))),
+        lambda run: run(on_receive=by.dropping(VELOCITY, range(100, 106))),
     ),
     Scenario(
         "queue", "three commands find no room", ("SEND_QUEUE_FULL",),
-        lambda run: run(on_send=failing(TransmitQueueFullError, 100, 200, 201)),
+        lambda run: run(on_send=by.failing(TransmitQueueFullError, 100, 200, 201)),
     ),
     Scenario(
         "dropped", "the kernel drops frames", ("FRAMES_DROPPED",),
-        lambda run: run(on_receive=changing(lambda frame: frame._replace(dropped=7), periods=range(200, 10_000))),
+        lambda run: run(on_receive=by.changing(lambda frame: frame._replace(dropped=7), periods=range(200, 10_000))),
     ),
     Scenario(
         "errors", "the controller reports errors", ("BUS_ERRORS",),
-        lambda run: run(on_receive=changing(reported, VELOCITY, range(200, 203))),
+        lambda run: run(on_receive=by.changing(by.reported, VELOCITY, range(200, 203))),
     ),
     Scenario(
         "no_status", "two status messages are lost", ("PERMISSION_LOST",),
-        lambda run: run(on_receive=dropping(STATUS, range(100, 300))),
+        lambda run: run(on_receive=by.dropping(STATUS, range(100, 300))),
     ),
     # On a bus: processes, the kernel, the host.
     Scenario("loop_killed", "kill -9 of the loop", (), None, (_signal("run", "SIGKILL", WHEN),), may_lose=IN_HAND),
