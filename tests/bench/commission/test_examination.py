@@ -147,10 +147,3 @@ def test_a_sensor_is_no_observer(acceleration: float) -> None:
     for seed, noise in itertools.product(range(4), (1e-3, 1e-4)):
         found = velocity_of([recorded(seed, acceleration, noise=noise)], T_S)
         assert (found, found.sensors, str(found)) == (Velocity(), Sensors(), "a sensor's")
-
-
-def test_lost_samples_tell_nothing() -> None:
-    lost = np.random.default_rng(5).uniform(size=500) < 0.02
-    loop, sensor = (recorded(1, STRONG, bandwidth).lose(lost) for bandwidth in (1520.0, 0.0))
-    assert velocity_of([loop], T_S).bandwidth == pytest.approx(1520.0, rel=0.02)
-    assert velocity_of([sensor], T_S) == Velocity()

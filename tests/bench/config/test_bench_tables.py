@@ -49,10 +49,6 @@ def test_what_is_said_is_read_and_the_rest_has_its_default() -> None:
     assert (euler.mechanics.solver, euler.instruments.clock_jitter) == (0, 1e-5)
 
 
-def test_the_plants_are_not_part_of_the_contract(bench: Bench) -> None:
-    assert parse_bench(TEXT, "my.toml").identity_hash == bench.identity_hash
-
-
 def test_what_makes_no_plant_is_refused_with_file_key_and_reason() -> None:
     for lines, key, reason in [
         (['solver = "rk4"'], "solver", "one of euler, exact"),
@@ -126,7 +122,8 @@ def test_budgets_are_read_as_they_stand() -> None:
     assert budgets.intervals == {"age": {"p99.9": 2e-4, "p100": 1.0}}
 
 
-def test_budgets_are_no_part_of_what_a_policy_depends_on() -> None:
+def test_neither_plants_nor_budgets_are_part_of_what_a_policy_depends_on(bench: Bench) -> None:
+    assert parse_bench(TEXT, "my.toml").identity_hash == bench.identity_hash
     assert with_budgets("").identity_hash == parse_bench(shipped_bench_text(), "t").identity_hash
 
 
