@@ -16,6 +16,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from emb_bench import api
+from emb_bench.analysis import stages
 from emb_bench.analysis.options import EstimateOptions
 from emb_bench.analysis.stages import make_study
 from emb_bench.batch.evaluate import evaluate_one
@@ -26,8 +27,10 @@ from emb_bench.cli.replay import main
 from emb_bench.config.bench import Bench
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.records import Unknown
+from emb_bench.experiment.experiment import Experiment
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.figures import COLOURS
-from emb_bench.logs.log import read_log
+from emb_bench.logs.log import RunLog, read_log
 from emb_bench.report import figures
 from emb_bench.report.page import html
 from emb_bench.report.report import Report as Made
@@ -217,6 +220,21 @@ def test_the_page_needs_nothing_but_itself(report: Report, joint: Report) -> Non
         policy = dict(part.strip().split(" ", 1) for part in made.reader.values("content")[0].split(";"))
         assert (policy["default-src"], policy["img-src"]) == ("'none'", "data:")
         assert set(policy) == {"default-src", "style-src", "img-src", "base-uri", "form-action"}
+
+
+def test_a_report_reads_each_experiment_once(
+    folder: Path, bench: Bench, good: Path, joint: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[str] = []
+
+    def counted(log: RunLog, *more: Any) -> Experiment:
+        seen.append(log.path.name)
+        return read_experiment(log, *more)
+
+    monkeypatch.setattr(stages, "read_experiment", counted)
+    made = gathered(bench, good, folder / "other.mcap")
+    assert [run.alone is not None for run in made.study.runs] == [True, True]
+    assert seen == [good.name, "other.mcap"]
 
 
 def test_the_numbers_are_those_of_the_command_estimate(report: Report, good: Path, replay: Replay) -> None:
