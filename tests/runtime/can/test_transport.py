@@ -300,11 +300,12 @@ def test_a_read_of_another_size_is_a_bus_error(size: int) -> None:
 
 def test_a_deadline_in_the_past_only_looks_and_waking_without_a_frame_waits_for_the_rest_of_the_time() -> None:
     rig = Rig()
-    assert rig.bus.receive(0) is None
+    rig.clock.advance_to(1_000)
+    assert [rig.bus.receive(deadline_ns) for deadline_ns in (1_000, 999, 0)] == [None] * 3
     assert rig.waits == []
     rig.script.append(lambda: rig.clock.advance_to(700_000))
     assert rig.bus.receive(1_000_000) is None
-    assert rig.waits == [pytest.approx(1e-3), pytest.approx(300e-6)]
+    assert rig.waits == [pytest.approx(999e-6), pytest.approx(300e-6)]
 
 
 STEPS_MS = (*range(1, 10), 0.05, 0.2, 0.5, 0.9, 1.1, 1.5, 1.9, 50, 3_600_000)

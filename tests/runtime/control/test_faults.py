@@ -191,6 +191,7 @@ def test_an_undeclared_response_ends_the_run_below_every_limit_and_with_the_name
         assert ran.outcome.fault is Fault.RESPONSE_LATE
         assert ran.outcome.response == ""
         assert max(abs(cycle.velocity) for cycle in ran.journal.cycles) < 250.0
+        assert_within_limits(ran)
         found = re.search(named, ran.outcome.detail)
         assert found is not None, ran.outcome.detail
         bench, value = SENSOR_BENCH, float(found[1])
@@ -208,17 +209,22 @@ def test_an_undeclared_response_ends_the_run_below_every_limit_and_with_the_name
         ("observer", {"sensors": Sensors("observer", 1480.0)}),
         ("lag", {"shield": SENSOR_BENCH.shield._replace(current_lag=0.002)}),
         ("late", {"shield": SENSOR_BENCH.shield._replace(frame_age=(0, 2))}),
+        ("late", {"shield": SENSOR_BENCH.shield._replace(frame_age=(2, 2))}),  # the answer acts two periods later
     ],
 )
-def test_a_response_that_is_declared_is_proven_and_the_outcome_says_so(
+def test_a_response_that_is_declared_is_proven_the_outcome_says_so_and_the_limits_hold(
     plant: str, declared: dict[str, Any], simulate: Simulate
 ) -> None:
-    ran = simulate(options=f"plant={plant}", on_bench=dataclasses.replace(SENSOR_BENCH, **declared))
-    assert ran.outcome.fault is None, ran.outcome.detail
-    assert re.fullmatch(
-        r"the velocity follows the commands with a delay of -?\d\.\d ± \d\.\d samples, at most [\d.]+ are declared",
-        ran.outcome.response,
-    )
+    for current in (6.0, -6.0):
+        ran = simulate(
+            lambda *_, i=current: i, options=f"plant={plant}", on_bench=dataclasses.replace(SENSOR_BENCH, **declared)
+        )
+        assert ran.outcome.fault is None, ran.outcome.detail
+        assert_within_limits(ran)
+        assert current < 0.0 or re.fullmatch(
+            r"the velocity follows the commands with a delay of -?\d\.\d ± \d\.\d samples, at most [\d.]+ are declared",
+            ran.outcome.response,
+        )
 
 
 @pytest.mark.parametrize(

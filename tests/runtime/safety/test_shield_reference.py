@@ -711,6 +711,13 @@ def test_a_law_for_fresh_answers_does_not_look_at_own_commands() -> None:
     assert shield(law, 5.0, 20.0, 1.0, past, law.steps) == shield(law, 5.0, 20.0, 1.0, NO_PAST, law.steps)
 
 
+@pytest.mark.parametrize("late", [{"age_low": 1, "age_high": 1}, {"lag": 2e-3, "kept": 0.6}])
+def test_where_own_commands_are_no_numbers_a_law_for_late_answers_brakes_fully(late: dict[str, float]) -> None:
+    law = with_numbers(SHIPPED, **late)
+    for sign in (1.0, -1.0):
+        assert window(law, 20.0, 100.0 * sign, (math.nan,) * 5) == (-sign * law.current,) * 2
+
+
 @pytest.mark.parametrize("velocity", [500.0, 0.5, 0.0, -0.5, -500.0])
 def test_where_both_sides_ask_for_full_braking_it_is_against_the_motion(velocity: float) -> None:
     law = drawn_law(Random(8))._replace(top=-1.0, bottom=1.0)
