@@ -133,7 +133,9 @@ def test_the_shield_covers_the_drawn_delay_and_no_more() -> None:
     conditions = Conditions(command_delay=(0, 2))
     for current in (6.0, -6.0):
         pushing, draws = constant(current), fresh_draws(PM50, 5, 40)
-        assert not play(BENCH, PM50, PARAMETER_NAMES, pushing, draws, "exact", conditions).violated.any()
+        outcome = play(BENCH, PM50, PARAMETER_NAMES, pushing, draws, "exact", conditions)
+        assert not outcome.violated.any()
+        assert outcome.home.all()
     plain, late = Conditions().applied(BENCH).shield, Conditions(command_delay=(1, 2))
     assert late.applied(BENCH).shield == plain._replace(frame_age=(0, 2))
     assert late.applied(late.applied(BENCH)) == late.applied(BENCH)

@@ -10,7 +10,7 @@ import pytest
 
 from emb_bench.config.bench import load_bench
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.policy.policy import Policy, load_policy
+from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
 from emb_runtime.safety.state_machine import Fault
 from tests.actors import constant_actor, speed_network
 from tests.conftest import Simulate
@@ -45,11 +45,14 @@ LIES: dict[str, Lie] = {
 }
 
 
+SHIPPED = "the shipped one"
+
+
 def network(name: str) -> Policy:
-    return load_policy(speed_network(BENCH, *NETWORKS[name]), BENCH)
+    return load_policy(shipped_actor_path() if name == SHIPPED else speed_network(BENCH, *NETWORKS[name]), BENCH)
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("name", [*NETWORKS, SHIPPED])
 def test_no_brake_of_the_set_leaves_its_limits_and_each_comes_home(name: str, simulate: Simulate) -> None:
     ranges, limits = BENCH.range_set(BENCH.shield.ranges), BENCH.limits
     shares = np.random.default_rng(7).uniform(-0.5, 1.5, (4, 4)).clip(0.0, 1.0)  # half of them at a border

@@ -123,6 +123,15 @@ def test_what_is_beyond_two_quartzes_adds_up(ppm: int, earliest: int, latest: in
     assert n >= earliest
 
 
+@pytest.mark.parametrize("ppm", [-400, 0, 400])
+def test_latencies_below_the_allowance_never_blame_a_quartz(ppm: int) -> None:
+    for seed in range(30):
+        draw, (clock, device_ns) = Random(seed), learned()
+        for n in range(1, 191):
+            arrival_ns = BASE + device_ns + n * MS + draw.choice((0, 1_900_000, draw.randrange(1_900_000)))
+            assert clock.time_problem(device_ns + n * (MS + ppm), arrival_ns, arrival_ns) == "", (seed, n)
+
+
 def test_samples_a_quarter_of_a_period_apart_are_off_the_grid() -> None:
     clock, device_ns = learned()
     for n in range(1, 20):

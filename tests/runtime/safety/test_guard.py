@@ -298,7 +298,11 @@ HURRIED = [0, MS // 5, MS]  # So that the rate limit binds
 
 def test_any_sequence_of_commands_is_judged_as_by_the_account() -> None:
     for seed in range(60):
-        play(Random(seed))
+        try:
+            play(Random(seed))
+        except AssertionError as err:
+            err.add_note(f"seed {seed}")
+            raise
 
 
 def play(draw: Random) -> Played:

@@ -241,7 +241,7 @@ def test_the_slow_law_is_that_of_the_page() -> None:
         slow = unproven_law(bench, law)
         assert slow.outward_speed == pytest.approx(min(law.outward_speed, fastest))
         assert slow.homeward_speed == pytest.approx(homeward)
-        assert slow.bottom == 0.5 * law.bottom
+        assert slow.bottom == 0.5 * law.bottom, seed
         home = law.home
         assert slow.home.cruise == pytest.approx(
             home.cruise * (homeward - home.creep) / (law.homeward_speed - home.creep)
