@@ -132,6 +132,7 @@ def test_a_command_says(say: Say, golden: Callable[[str, str], None], name: str,
         ("estimate", ["--starts", "1"], 0),
         ("report", ["--starts", "1", "-o", "page.html"], 0),
         ("export", ["--topic", "/cycle", "-o", "cycles.csv"], 0),
+        ("export", ["-o", "run.png"], 0),
     ],
 )
 def test_what_a_cut_log_lacks_is_said_first(say: Say, command: str, more: list[str], code: int) -> None:

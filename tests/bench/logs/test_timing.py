@@ -77,6 +77,9 @@ def test_every_interval_is_the_difference_of_its_stamps(measure: Measure) -> Non
         np.testing.assert_allclose(t.interval(name), value, rtol=1e-12)
     np.testing.assert_allclose(t.times, 1e-3 * np.arange(20), rtol=0, atol=1e-15)
     assert not t.simulated
+    outside = measure(cycle(-1, START))
+    assert outside.clock is None
+    assert all(len(outside.interval(name)) == 0 for name in INTERVALS)
 
 
 def test_a_missed_period_is_counted_and_is_no_long_one(measure: Measure) -> None:

@@ -195,6 +195,15 @@ def test_a_run_of_a_few_samples_is_reported_without_an_estimate(
 
 
 @pytest.mark.slow
+def test_residuals_are_those_whose_squares_are_the_deviance_and_the_angle_is_the_log_s(
+    report: Report, good: Path
+) -> None:
+    run = report.numbers["runs"][0]
+    errors = np.array([run["residuals"][name] for name in ("angle", "velocity")])
+    assert (errors**2).sum() == pytest.approx(report.numbers["estimate"]["misfit"]["chi2"])
+    assert run["experiment"]["angle"] == read_experiment(read_log(good)).all_samples[:, 0].tolist()
+
+
 def test_links_lead_somewhere_and_names_are_unique(report: Report, joint: Report) -> None:
     for made in (report, joint):
         names = made.reader.values("id")

@@ -128,6 +128,7 @@ def test_a_signal_in_the_middle_ends_the_run_with_stop_frames_and_a_whole_log(em
         summary = emb_run.document(code=3)
         assert summary["result"] == "INTERRUPTED"
         log = emb_run.log()
+        assert log.attachments["bench.toml"].decode() == shipped_bench_text()
         assert log.complete
         assert log.end["exit_reason"] == "INTERRUPTED"
         assert list(log.signals("EMB_Command")["Enable"][-4:]) == [1, 0, 0, 0]

@@ -83,6 +83,7 @@ def test_a_node_that_lies_meanwhile_does_not_drive_it_out_of_its_limits(lie: str
     [
         (math.nan, Fault.POLICY_NOT_FINITE, "it answered nan"),
         (-math.inf, Fault.POLICY_NOT_FINITE, "it answered nan"),
+        (math.inf, Fault.POLICY_NOT_FINITE, "it answered nan"),
         (1e9, Fault.POLICY_BEYOND_CONTRACT, "it requested 2e+06 times what its contract allows"),
         (-900.0, Fault.POLICY_BEYOND_CONTRACT, "it requested 1.8 times what its contract allows"),
         *((beyond, Fault.POLICY_BEYOND_CONTRACT, "it requested 1 times") for beyond in (500.001, -500.001)),
