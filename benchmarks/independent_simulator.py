@@ -335,8 +335,9 @@ def simulate(
     losses: Losses | None = None,
     *,
     charge: bool = False,
+    planned: Floats | None = None,
 ) -> Experiment:
-    """An experiment: a random excitation that is turned around near the limits.
+    """An experiment: the planned currents [A], or a random excitation that is turned around near the limits.
 
     Where the report of a period is lost, the record assumes that its command acted, or where none was sent, the node's
     braking from the last velocity that arrived. With ``charge`` the samples on both sides of a single lost one carry
@@ -344,7 +345,7 @@ def simulate(
     """
     n, t_s, b = bench.timing.horizon, bench.timing.sample_time * (1.0 + brake.clock_scale), brake.numbers()
     constant = b[_KM : _FV + 1].copy()
-    requested = excitation(rng, n, bench.limits.current)
+    requested = excitation(rng, n, bench.limits.current) if planned is None else planned
     state, before = (0.0, 0.0, brake.current_offset, 0.0, 0.0), 0.0
     currents, acted, samples = np.empty(n), np.empty(n), np.empty((n, 2))
     sensors = _Sensors(brake, bench, rng)
@@ -355,7 +356,9 @@ def simulate(
     for k in range(n):
         u = requested[k]
         ahead = angle + 0.04 * velocity
-        if ahead > highest - 25.0 or velocity > bench.limits.velocity - 120.0:
+        if planned is not None:
+            pass
+        elif ahead > highest - 25.0 or velocity > bench.limits.velocity - 120.0:
             u = -bench.limits.current * 0.7
         elif ahead < lowest + 6.0 or velocity < -(bench.limits.velocity - 120.0):
             u = bench.limits.current * 0.7

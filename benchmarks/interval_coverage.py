@@ -9,6 +9,7 @@ no code with the estimators. The cases are ``CASES``:
 - ``total``: a right model, all systematic errors drawn from their priors in the bench file;
 - ``inertia``, ``angle_scale``: only that one drawn;
 - ``unlisted``: a small error of the model of one of ``UNLISTED``;
+- ``unlisted-actor``: the same under the currents with which the shipped actor excites a brake without that error;
 - ``drawn``: a small error of the model whose form is drawn: 20 kinds (:func:`kind_of`);
 - ``prior``: errors and effects drawn from all priors;
 - ``known``: a right model whose k_m was measured to 0.1 %, its inertia drawn with 5 %, the scale of the angle with its
@@ -46,6 +47,7 @@ from scipy import stats
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the simulator is a neighbour
 
 from benchmarks.independent_simulator import ALONG, TORQUES, Brake, Floats, Losses, brake_of, simulate
+from emb_bench import api
 from emb_bench.analysis.conclusion import noise_deviations
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import Plant
@@ -54,6 +56,7 @@ from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.records import FREE, NORMAL_95, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
+from emb_bench.experiment.from_log import read_experiment
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.numbers import in_percent
 
@@ -198,8 +201,14 @@ def near_misses(bench: Bench, draws: int, seed: int) -> Iterator[Drawn]:
                 seed += 2
 
 
-def unlisted(bench: Bench, draws: int, seed: int) -> Iterator[Drawn]:
-    """Wrong models of the kinds in ``UNLISTED``, ``draws`` of each size."""
+def actor_currents(brake: Brake, seed: int) -> Floats:
+    """Currents of a simulated run with the shipped actor on a brake that the model describes [A]."""
+    parameters = {"k_m": brake.k_m, "k_1": brake.k_1, "T_c": brake.t_c, "f_v": brake.f_v}
+    return read_experiment(api.simulate(parameters=parameters, seed=seed)).currents
+
+
+def unlisted(bench: Bench, draws: int, seed: int, *, actor: bool = False) -> Iterator[Drawn]:
+    """Wrong models of the kinds in ``UNLISTED``, ``draws`` of each size; with the shipped actor's currents if so."""
     plant = bench.plant("exact")
     for name, given, error, sizes in UNLISTED:
         for at in range(seed, seed + draws * len(sizes)):
@@ -207,7 +216,7 @@ def unlisted(bench: Bench, draws: int, seed: int) -> Iterator[Drawn]:
             sign = 1.0 if error in {"dead_current", "velocity_lag", "load_friction"} else float(rng.choice((-1.0, 1.0)))
             right = brake_of(bench, plant, rng.uniform(0.5, 1.5, 4))
             wrong = Brake(**(vars(right) | given | {error: sign * sizes[at % len(sizes)]}))
-            record = simulate(wrong, bench, rng, f"seed {at}")
+            record = simulate(wrong, bench, rng, f"seed {at}", planned=actor_currents(right, at) if actor else None)
             yield Drawn(name, bench, plant, record, wrong)
         seed += draws * len(sizes)
 
@@ -397,6 +406,7 @@ CASES: Mapping[str, Callable[[Bench, int, int], Iterator[Drawn]]] = {
     "known": known,
     "near-misses": near_misses,
     "unlisted": unlisted,
+    "unlisted-actor": partial(unlisted, actor=True),
     "drawn": drawn_kinds,
     "prior": prior,
     "disturbance": disturbance,
