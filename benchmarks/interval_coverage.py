@@ -14,7 +14,8 @@ no code with the estimators. The cases are ``CASES``:
 - ``prior``: errors and effects drawn from all priors;
 - ``known``: a right model whose k_m was measured to 0.1 %, its inertia drawn with 5 %, the scale of the angle with its
   prior or right and excluded;
-- ``near-misses``: a small error of the model of one of ``KINDS`` in one of three sizes, in turns with a right model;
+- ``near-misses``: a misspecified model: a small error of one of ``KINDS`` in one of three sizes, in turns with a
+  right model;
 - ``disturbance``: the velocity or the load walks at random, and the estimator does not know;
 - ``losses``: 2, 5 and 10 % of the samples are lost, one by one or in bursts of 20 ms, and a fifth as many commands;
 - ``charge``: the same, and the node sends the integral of its current along;

@@ -1,4 +1,4 @@
-"""Comparison of policies with excitations that need no learning, by the estimates to come: paired by fresh brake.
+"""Comparison of policies with excitations that need no learning, by the estimates to come: paired by new brake.
 
     python benchmarks/policies.py [POLICY ...] [--draws 500] [--plant exact,observer] [--seed 4040]
 

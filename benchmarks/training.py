@@ -133,7 +133,7 @@ class Network:
 
 
 def on_grid(trained: Trained, training: Training, bench: Bench) -> dict[str, Outcome]:
-    """The trained actor and the best blind switch on the grid, with the same noise."""
+    """The trained actor and the best open-loop switch on the grid, with the same noise."""
     ranges, limit, horizon = bench.range_set(training.ranges), bench.limits.current, bench.timing.horizon
     draws = grid_draws(ranges, training.parameters[0], training.seed)
 

@@ -54,7 +54,7 @@ COMPARED = (
     *("square", "chirp", "prbs", "multisine", "ramp", "step", "constant-speed"),
     *("square:period=0.36", "constant-speed:turn=0.15"),
 )
-"""Excitations that an actor is compared with. The last two reverse once: the best ones without learning."""
+"""Excitations that an actor is compared with. The last two reverse once."""
 
 SPEED_GAIN = 0.5
 """Share of a speed error that constant-speed removes per sample on the nominal brake; up to 2 would be stable."""

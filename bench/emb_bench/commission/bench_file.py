@@ -27,7 +27,9 @@ SHEET, MEASURED = "sheet", "measured"  # Names of the sets of ranges
 WRITTEN = "# Written by emb-commission from a data sheet's bench file. SI units."
 """Mark of a bench file of a commissioning."""
 HEAD = f"#:schema ./bench.schema.json\n{WRITTEN}\n# A number without a source behind it is from that file.\n"
-UNEXPLAINED = 9.0  # Mean square of the residuals, in variances of the noise at rest, above which no model is accepted
+UNEXPLAINED = (
+    9.0  # Mean square of the residuals, in variances of the noise at rest, above which the sheet's ranges stay
+)
 WIDENED = 0.1  # Share of its value by which a range exceeds the interval: brakes change as they warm and wear
 WIDENED_MISFIT = 0.25  # Share where the residuals contradict every model
 NOISE_WIDENED = 1.2  # Factor from a measured standard deviation to the written one
@@ -167,7 +169,7 @@ def _put_velocity(document: TOMLDocument, velocity: Velocity, logs: str) -> None
     document.add("sensors", tomlkit.table())
     _put(document, "sensors.velocity", velocity.sensors.velocity, f"measured with {logs}: {velocity}")
     if velocity.least:
-        origin = f"{MARGIN:.0%} of the slowest that cannot be excluded, or of an equivalent one"
+        origin = f"{MARGIN:.0%} of the slowest that cannot be excluded, at most 3/sample_time"
         _put(document, "sensors.observer_bandwidth", _rounded(velocity.least), origin)
 
 

@@ -1,6 +1,6 @@
 """Faults of a recording and its map, looked for before anything is estimated: each a row of a table.
 
-Times that make no grid, an angle that begins anew and special values are refused, with the row of the file. A
+Times that make no grid, an angle that wraps around and special values are refused, with the row of the file. A
 contradiction of the equations of motion, which holds for any friction, refuses nothing; it is named first where the
 model does not fit. Pure functions of arrays and the map.
 
@@ -274,7 +274,7 @@ WRAPPED: Checks[Series] = {
 ANGLES: Checks[Series] = {
     _is_huge: VALUES[_is_huge],
     _is_alone: SPECIAL_SENTENCE,
-    _wraps: "{name} jumps by {period:.10g} after row {row}, {count} times in all: it begins anew after a period; "
+    _wraps: "{name} jumps by {period:.10g} after row {row}, {count} times in all: it wraps around after a period; "
     "wrap = {period:.10g} of the signal continues it",
     _is_special: SPECIAL_SENTENCE,
     _is_set: "{name} jumps from {value:.6g} to {then:.6g} after row {row}, {count} times in all, as no motion does: "

@@ -54,7 +54,7 @@ class Signal(msgspec.Struct, frozen=True, kw_only=True):
     between: Literal["held", "linear"] = "held"  # Course of a command from its stamp to the next one
     range: tuple[float, float] = (-math.inf, math.inf)  # Values of the column that are believed
     special: tuple[float, ...] = ()  # Values of the column that say that there is none
-    wrap: Positive = 0.0  # Period after which an angle begins anew, in the column's unit; 0 if it does not
+    wrap: Positive = 0.0  # Period after which an angle wraps around, in the column's unit; 0 if it does not
 
     @property
     def place(self) -> Place:
@@ -137,7 +137,7 @@ class Timing(msgspec.Struct, frozen=True, kw_only=True):
     column: str = ""  # Empty where rows are ``sample_time`` apart, or the format has times of its own
     unit: Literal["s", "ms", "us", "ns"] = "s"  # Of the column
     tick: Positive = 0.0  # Time of one count of the column [s], in place of ``unit``
-    wrap: Positive = 0.0  # Counts after which the column begins anew; 0 if it does not
+    wrap: Positive = 0.0  # Counts after which the column wraps around; 0 if it does not
     fraction: str = ""  # Second column, whose time is added: that within the second, say
     fraction_unit: Literal["s", "ms", "us", "ns"] = "us"
     sample_time: Annotated[float, Meta(ge=1e-4, le=0.1, description="a time from 0.0001 to 0.1 s")] = 0.0

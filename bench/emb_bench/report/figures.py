@@ -251,7 +251,7 @@ def profiles(found: Sequence[Profile], e: Estimate) -> bytes:
             axis.plot(x, profile.rise, ".-", color=COLOURS[0], markersize=4)
             axis.set_ylim(-0.4, max(8.0, 1.2 * LEVEL))
             if n % ACROSS == 0:
-                axis.set_ylabel("rise of chi2")
+                axis.set_ylabel("increase of chi2")
             axis.set_xlabel(f"{profile.label} [{unit}]")
             axis.locator_params(axis="x", nbins=3)
             axis.ticklabel_format(axis="x", style="plain", useOffset=False)

@@ -360,9 +360,9 @@ def _evidence(study: Study) -> Iterator[Section]:
         labels = ", ".join(p.label for p in checks.profiles)
         shows = f"Increase of chi-squared with {labels}, beside the parabola of the Fisher information"
         caption = (
-            "Increase of chi2 with one parameter fixed, relative to its estimate; all others are fitted again. Pale: "
-            "the parabola of the Fisher information. Values below the dashed line are in the 95 % interval of a right "
-            "model. The intervals above also include effects that the model may lack."
+            "Increase of chi2 over the value of one unknown, relative to its estimate; all others are fitted again. "
+            "Pale: the parabola of the Fisher information. Values below the dashed line are in the 95 % interval of a "
+            "right model. The intervals above also include effects that the model may lack."
         )
         panel = Panel(figures.profiles(checks.profiles, e), shows)
         blocks += [Figures([panel], caption, wide=True)]

@@ -101,7 +101,7 @@ def headline(study: Study) -> str:
     missed = ", ".join(study.unidentified)
     others = len(study.unidentified) < len(study.estimate.question.params)
     return {
-        Code.BIASED_METHOD: f"NOT JUDGED: recursive least squares does not reproduce the record (chi2/n "
+        Code.BIASED_METHOD: f"NO VERDICT: recursive least squares does not reproduce the record (chi2/n "
         f"{plain(m.ratio)}). Noise biases its values; the model is not tested. Use --method oem.",
         Code.DOES_NOT_FIT: f"THE MODEL '{name}' DOES NOT FIT{size}: the intervals do not include its error.",
         Code.DOES_NOT_PREDICT: f"THE MODEL '{name}' DOES NOT PREDICT other records: the values hold only for the "

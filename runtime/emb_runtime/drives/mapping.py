@@ -56,7 +56,7 @@ class Measured:
     offset: float  # SI value at zero
     low: float
     high: float  # Least and largest value that is believed [DBC units]
-    wrap: float  # Period after which it begins anew [DBC units]; 0 if it does not
+    wrap: float  # Period after which it wraps around [DBC units]; 0 if it does not
 
     def si(self, value: float) -> float:
         """A value in DBC units in SI units."""
@@ -64,7 +64,7 @@ class Measured:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Values that it may have [SI units]; all where it begins anew."""
+        """Values that it may have [SI units]; all where it wraps around."""
         return (-math.inf, math.inf) if self.wrap else (self.si(self.low), self.si(self.high))
 
 

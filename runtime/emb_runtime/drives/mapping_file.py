@@ -69,7 +69,7 @@ class _Signal(Struct, kw_only=True):
 class _Angle(_Signal, kw_only=True):
     unit: Literal["rad", "deg", "rev"]
     offset: float = 0.0
-    wrap: Positive | None = None  # Period after which it begins anew [DBC units]
+    wrap: Positive | None = None  # Period after which it wraps around [DBC units]
 
 
 class _Velocity(_Signal, kw_only=True):

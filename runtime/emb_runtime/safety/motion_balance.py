@@ -36,7 +36,7 @@ COEFFICIENTS: Final = 8  # And of the two earlier currents, curved stiffness, fr
 STRIDE: Final = 20  # Samples between two entries, at first
 ENTRIES: Final = 32  # When so many are stored, every second one is dropped and the stride doubles
 PAST: Final = 2  # Earlier currents that may still act
-LEAST_PERIODS: Final = 40  # Periods in which the brake slid, below which nothing is judged
+LEAST_PERIODS: Final = 40  # Periods in which the brake slid, below which there is no verdict
 NOISE: Final = 25.0  # Allowed for noise, in standard deviations of the velocity
 MISFIT: Final = 0.05  # Allowed for what the brake is beside its coefficients, as a share of the largest speed
 LATE: Final = 0.16  # Allowed beside that for a current that acts a sample late, likewise
@@ -46,7 +46,7 @@ REST_SAMPLES: Final = 20  # Last samples of a node at rest that are looked at; e
 MOVING: Final = 2.0  # Mean velocity that no brake at rest has, in standard deviations of a measurement
 TERMS: Final = COEFFICIENTS + 1  # And the spring's origin, as a share of the travel
 WIDTH: Final = TERMS + 1  # And the change of the velocity
-ORIGIN_ALLOWED: Final = 2.2  # Distance of the origin from 0 that an honest run may show, beside what follows [rad]
+ORIGIN_ALLOWED: Final = 2.2  # Distance of the origin from 0 that a fault-free run may show, beside what follows [rad]
 ORIGIN_ERRORS: Final = 6.0  # Errors of the origin that are allowed, in standard deviations
 ORIGIN_LATE: Final = 20.0  # Allowed where all of the current acts late, or the velocity lags [rad]
 Rows = list[list[float]]
@@ -64,7 +64,7 @@ class BalanceModel(NamedTuple):
     travel: float  # Largest angle [rad]
     slides: float  # Speed above which a period counts [rad/s]
     prior: float  # Weight of the nominal brake in the normal equations [rad²/s²]
-    allowed: float  # Unexplained velocity of an honest run; infinite where nothing is judged [rad/s]
+    allowed: float  # Limit of the unexplained velocity; infinite where there is no verdict [rad/s]
     stretch: float  # Allowed beside that for each stretch [rad/s]
     load: float  # What friction that grows with the load may explain [rad/s]
     late: float  # Allowed beside that where all of the current acts a sample late [rad/s]
@@ -224,7 +224,7 @@ def _centred(state: State) -> Rows:
 
 
 def unexplained(model: BalanceModel, state: State) -> tuple[float, float]:
-    """Velocity that the best brake leaves unexplained, and what an honest run may leave [rad/s].
+    """Velocity that the best brake leaves unexplained, and what a fault-free run may leave [rad/s].
 
     The first is the range of the sum of its residuals. Friction that grows with the load can look like much that is
     none: it may explain ``model.load`` and no more. The second is infinite where too little slid.
@@ -341,7 +341,7 @@ class MotionBalance:
             self.check_motion()
 
     def check_motion(self) -> tuple[float, float]:
-        """Unexplained velocity and what is allowed, infinite where nothing is judged [rad/s].
+        """Unexplained velocity and its limit, infinite where there is no verdict [rad/s].
 
         Raises StopError if it is more than that.
         """

@@ -332,7 +332,7 @@ def _accelerated(
     u = u if u < own else own
     strong, weak = motor_high * u, motor_low * u
     down = stiff - (weak if weak < strong else strong)
-    # Friction grows with the speed; against the direction of the acceleration it adds to it.
+    # Friction lowers the acceleration in the direction of the motion, and raises the one against it.
     if slow > 0.0:
         taken = viscous_low * slow
         up, obeyed_up = up - friction_low - taken, obeyed_up - friction_low - taken

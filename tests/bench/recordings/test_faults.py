@@ -51,7 +51,7 @@ SPECIAL = "are apart from all others, the first one"
 REFUSED = {
     "a wrapped angle": Fault({"angle": RIGHT["angle"] % TURN}, "wrap = 6.283185307", {"angle": f"wrap = {TURN}"}),
     "one about zero": Fault(
-        {"angle": (RIGHT["angle"] + 3.0) % TURN - 3.0}, "begins anew after a period", {"angle": f"wrap = {TURN}"}
+        {"angle": (RIGHT["angle"] + 3.0) % TURN - 3.0}, "wraps around after a period", {"angle": f"wrap = {TURN}"}
     ),
     "one in degrees": Fault(
         {"angle": np.degrees(RIGHT["angle"]) % 360.0},
