@@ -15,7 +15,7 @@ from emb_bench.estimate.records import NORMAL_95, Unknown
 from emb_bench.information.identifiability import Doubt
 
 LEVEL = NORMAL_95**2
-"""Rise of χ² that one parameter stays below in 95 % of experiments: a quantile of χ² with one degree of freedom."""
+"""Increase of χ² that one parameter stays below in 95 % of experiments: a quantile of χ² with one degree of freedom."""
 AGREES = 0.1  # Largest relative difference of two half-widths that count as equal
 NEGLIGIBLE = 0.01  # Weight below which a model does not count in an interval
 

@@ -196,13 +196,13 @@ def emb_run(arguments: Sequence[str]) -> Mapping[str, Any]:
         for number, handler in before.items():
             signal.signal(number, handler)
     if ended and not printed.strip():
-        raise SafetyStopError("stopped by the operator before a run; the same command goes on from there")
+        raise SafetyStopError("stopped by the operator before a run; the same command continues from there")
     if not printed.strip():
         exit_code = process.returncode if process.returncode > 0 else EXIT_SAFETY_STOP
         raise StepFailedError("emb-run ended without a result; its message is above", exit_code)
     document: dict[str, Any] = json.loads(printed)
     if ended and document["result"] == "done":
-        raise SafetyStopError("stopped by the operator after a run; the same command goes on from there")
+        raise SafetyStopError("stopped by the operator after a run; the same command continues from there")
     return {**document, "exit_code": process.returncode}
 
 

@@ -233,7 +233,7 @@ def axis_unit(e: Estimate, i: int, farthest: float) -> tuple[float, str]:
 
 
 def profiles(found: Sequence[Profile], e: Estimate) -> bytes:
-    """Rise of χ² over the distance from the estimate, beside the parabola that the Fisher information stands for."""
+    """Increase of χ² over the distance from the estimate, beside the parabola of the Fisher information."""
     columns, rows = min(len(found), ACROSS), -(-len(found) // ACROSS)
 
     def draw(axes: Any) -> None:

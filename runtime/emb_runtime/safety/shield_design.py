@@ -68,7 +68,7 @@ class Hidden(NamedTuple):
 
     periods: tuple[float, float, float, float, float]  # In each period before the measurement, newest first
     before: tuple[float, float, float, float, float, float]
-    """Before those of them whose own commands are known, by the age of the measurement: :func:`unseen`."""
+    """Before those of them whose commands are known, by the age of the measurement: :func:`unseen`."""
 
 
 class Delay(NamedTuple):
