@@ -455,11 +455,11 @@ def test_the_first_differences_are_printed_and_the_exit_code_says_so(
 def test_with_differences_the_versions_of_the_log_are_named(
     with_policy: Callable[..., list[str]], replay: Replay
 ) -> None:
-    others = {"tool": "emb-excite 0.0.1", "onnxruntime": "1.0.0"}
+    others = {"tool": "emb-excite 0.0.1", "onnxruntime": "1.0.0", "libc": "glibc 2.0"}
     assert "0.0.1" not in replay.text(*with_policy(**others))
     out = replay.text(*with_policy(altered(3, "policy_current", lambda value: value + 1e-7), **others), code=1)
     assert "tool emb-excite 0.0.1" in out
-    assert "onnxruntime 1.0.0: rounding may differ" in out
+    assert "onnxruntime 1.0.0, libc glibc 2.0: rounding may differ" in out
 
 
 def test_a_policy_or_a_bench_that_is_not_the_run_s_is_reported(

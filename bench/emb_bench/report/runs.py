@@ -210,7 +210,7 @@ def rerun_text(again: Rerun, *, verbose: bool = False) -> str:
     if len(again.differences) > shown:
         lines.append(f"  and {len(again.differences) - shown} more (-v shows all)")
     if not again.reproduced:
-        names = ("tool", "python", "numpy", "onnxruntime")
+        names = ("tool", "python", "numpy", "onnxruntime", "libc")
         made = ", ".join(f"{name} {log.run[name]}" for name in names if name in log.run)
         lines.append(f"  the log was made with {made}: rounding may differ with others")
     return "\n".join(lines)

@@ -189,6 +189,7 @@ def header(
         "python": platform.python_version(),
         "onnxruntime": metadata.version("onnxruntime"),
         "numpy": metadata.version("numpy"),
+        "libc": " ".join(platform.libc_ver()).strip() or None,  # onnxruntime takes sinh from it
         "kernel": f"{platform.system()} {platform.release()} {platform.machine()}",
         "time": f"{slow} times slower than the computer's" if slow != "1" else None,
         "operator": label.operator or None,
