@@ -76,7 +76,7 @@ class Encoder:
 
 
 class Outlet:
-    """Sends frames to a drive, with currents up to a limit [A]; a frame that the full queue refuses is lost and counted.
+    """Sends frames to a drive, with currents up to a limit [A]; one that the full queue refuses is lost and counted.
 
     Its methods raise BusError if the bus is lost.
     """
