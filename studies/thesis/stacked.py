@@ -32,7 +32,7 @@ from emb_train.ppo import (
     mean_return,
     surrogate,
 )
-from emb_train.training import Training, Validation, begin_training, note, validated
+from emb_train.training import Training, Validation, begin_training, validated, write_progress
 
 
 class Stack(nn.Module):
@@ -166,7 +166,7 @@ def train_together(trainings: Mapping[Path, Training], bench: Bench) -> Iterator
             of_all = replace(rollout, **made, mean_return=mean_return(made["rewards"], made["terminals"], env.batch))
             counts = {"iteration": iteration + 1, "steps": (iteration + 1) * ppo.batch, **of_all.counts}
             deviation = float(actors.log_deviations[k].detach().exp())
-            note(folder, counts | {"mean_return": of_all.mean_return, "deviation": deviation, "score": score})
+            write_progress(folder, counts | {"mean_return": of_all.mean_return, "deviation": deviation, "score": score})
     for folder, member in zip(trainings, members, strict=True):
         yield folder, member.best
 

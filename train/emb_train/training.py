@@ -229,13 +229,13 @@ def run_training(
         validation, best = Validation(training, bench, pool), -math.inf
         if training.plan is not None:
             best = validation.score(actor)
-            note(folder, {"iteration": 0, "steps": 0, "score": best})
+            write_progress(folder, {"iteration": 0, "steps": 0, "score": best})
             yield Trained(copy.deepcopy(actor), 0, best)
             if stopped:
                 raise KeyboardInterrupt
         for metrics in train(envs, actor, training.ppo, training.seed):
             score = validation.score(actor) if validated(metrics.iteration, training.ppo.iterations) else None
-            note(folder, asdict(metrics) | {"score": score})
+            write_progress(folder, asdict(metrics) | {"score": score})
             show(metrics)
             if score is not None and score > best:
                 best = score
@@ -247,7 +247,7 @@ def validated(iteration: int, iterations: int) -> bool:
     return iteration in (1, iterations) or iteration % max(1, iterations // VALIDATIONS) == 0
 
 
-def note(folder: Path, record: dict[str, Any]) -> None:
+def write_progress(folder: Path, record: dict[str, Any]) -> None:
     """Write a line of a training's progress."""
     with (folder / METRICS).open("a", encoding="utf-8") as file:
         file.write(json_document(record) + "\n")
