@@ -1,5 +1,5 @@
 # make demo   one simulated experiment with the shipped actor, and its report as a page
-# make test   style, types, and the tests: no root, no kernel, nothing outside .venv (eight minutes on two processors)
+# make test   style, types, and the tests: no root, no kernel, nothing outside .venv (six minutes on two processors)
 # make hil    the programs as shipped on a real vcan0, with faults; needs user-mode-linux, gcc, libc6-dev, iproute2
 # make browser   pages in a real browser: a run on its live page, a report on screen and on paper; needs chromium, pdftotext
 # make night  what takes longer: slow tests, every fault, searches, fuzzing, all mutants
