@@ -15,6 +15,7 @@ from emb_bench.config.plants import Instruments, Plant
 from emb_bench.sim.node import BrakeNode
 from emb_bench.sim.simulated_brake import gaussian_noise
 from emb_runtime.can.messages import Layout, StopReason, load_layout
+from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.records import Frame, NodeState
 from emb_runtime.safety.state_machine import Fault
 from tests.conftest import Simulate
@@ -289,3 +290,17 @@ def test_full_current_on_any_plant_ends_by_itself_and_as_documented(
     assert run.outcome.fault is ENDS[plant]
     if run.outcome.fault is None:
         assert run.outcome.counters.answered == bench.timing.horizon
+
+
+@pytest.mark.parametrize("plant", ["euler", "exact"])
+@pytest.mark.parametrize("theta", ["f_v=1e-5", "f_v=5e-5", "f_v=1e-5,k_m=3.2e-2", "f_v=5e-5,k_m=1.1e-2"])
+def test_the_shipped_actor_keeps_the_limits_at_the_ends_of_the_ranges_and_the_brake_comes_home(
+    simulate: Simulate, bench: Bench, plant: str, theta: str
+) -> None:
+    run = simulate(actor=load_policy(shipped_actor_path(), bench), options=f"plant={plant},{theta}")
+    node, limits = run.transport.node, bench.limits
+    low, high = node.angle_range
+    assert run.outcome.fault is None
+    assert limits.angle[0] <= low <= high <= limits.angle[1]
+    assert node.top_speed <= limits.velocity
+    assert run.outcome.home
