@@ -356,11 +356,9 @@ def simulate(
     for k in range(n):
         u = requested[k]
         ahead = angle + 0.04 * velocity
-        if planned is not None:
-            pass
-        elif ahead > highest - 25.0 or velocity > bench.limits.velocity - 120.0:
+        if planned is None and (ahead > highest - 25.0 or velocity > bench.limits.velocity - 120.0):
             u = -bench.limits.current * 0.7
-        elif ahead < lowest + 6.0 or velocity < -(bench.limits.velocity - 120.0):
+        elif planned is None and (ahead < lowest + 6.0 or velocity < -(bench.limits.velocity - 120.0)):
             u = bench.limits.current * 0.7
         commanded = round(float(u), 3) if received else braking(bench, float(velocity))
         u = commanded if received and not (losses and losses.commands[k]) else braking(bench, state[1])

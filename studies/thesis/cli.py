@@ -48,8 +48,8 @@ trainings: {", ".join(TRAININGS)}
 Each statement of the thesis gets a verdict: 'agrees' or 'does not follow' (from its own equations, or in trainings made
 again), or 'only suggested' where the thesis says no more than that it is possible. docs/studies/ explains what does not
 follow. Trainings are kept in DIR: one that is there is not repeated. Table 5.1, Fig. 5.9 and Table 6.2 take all seeds,
-the others the first: 71 million environment steps, with --seeds 1 19 million. With --steps no verdict counts. An
-interrupted training is made anew by the next call.
+the others the first: 71 million environment steps, with --seeds 1 19 million. With --steps no verdict counts. The next
+call makes interrupted trainings anew; those of several seeds are made side by side.
 
 --set gives values that the thesis does not print, or prints in two ways: deviation=6 (first standard deviation [A]),
 tracking=0.1 (factor of the weights of the deviation from the quintic), draws=normal, normalised_by=nominal (eq. 4.17).
@@ -92,7 +92,7 @@ def main(argv: list[str] | None = None) -> int:
     except EmbError as err:
         return complain(PROGRAM, err)
     except KeyboardInterrupt:
-        mention(f"{PROGRAM}: interrupted; the next call makes that training anew")
+        mention(f"{PROGRAM}: interrupted; the next call makes what was not finished anew")
         return EXIT_INTERRUPTED
     return EXIT_DONE
 

@@ -14,7 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -29,7 +28,9 @@ from emb_train.ppo import (
     collect,
     exploration_noise,
     generalised_advantages,
+    log_density,
     mean_return,
+    random_numbers,
     surrogate,
 )
 from emb_train.training import Training, Validation, begin_training, validated, write_progress
@@ -51,9 +52,8 @@ class Stack(nn.Module):
         *hidden, (to_output, bias) = zip(self.weights, self.biases, strict=True)
         for weight, shift in hidden:
             x = self.tanh(torch.baddbmm(shift, x, weight))
-        output: Tensor = (x * to_output.mT).sum(
-            2, keepdim=True
-        ) + bias  # a product of matrices takes four times as long
+        # To a single output a product of matrices takes four times as long.
+        output: Tensor = (x * to_output.mT).sum(2, keepdim=True) + bias
         return output
 
     def write(self, k: int, network: nn.Sequential) -> None:
@@ -86,7 +86,7 @@ class Actors(nn.Module):
 
     def log_density_of(self, noise: Tensor) -> Tensor:
         """Log π of actions this many standard deviations from their means, shape [T, K N, 1] to [T, K N]."""
-        return _log_density(noise, self.log_deviation)
+        return log_density(noise, self.log_deviation)
 
     def exploring(self, each: int) -> Actor:
         """As the actor of ``each`` experiments for every one of the K."""
@@ -99,11 +99,6 @@ class Actors(nn.Module):
         with torch.no_grad():
             actor.log_deviation.copy_(self.log_deviations[k, 0])
         return actor
-
-
-def _log_density(noise: Tensor, log_deviation: Tensor) -> Tensor:
-    density: Tensor = -0.5 * noise.square() - log_deviation - 0.5 * math.log(2.0 * math.pi)
-    return density.squeeze(-1)
 
 
 class Member(NamedTuple):
@@ -120,7 +115,8 @@ def train_together(trainings: Mapping[Path, Training], bench: Bench) -> Iterator
     """Train several actors, each with progress in its folder, which is made.
 
     Args:
-        trainings: by folder; they differ by seed and first deviation alone.
+        trainings: by folder, with the thesis's hyper-parameters: no pairs, no held noise, no final deviation. They
+            differ by seed and first deviation alone.
         bench: limits, noise, timing.
 
     Yields:
@@ -143,12 +139,8 @@ def train_together(trainings: Mapping[Path, Training], bench: Bench) -> Iterator
     actors, critic = Actors([member.actor for member in members]), Stack(critics)
     optimiser = torch.optim.Adam([*actors.parameters(), *critic.parameters()], eps=1e-5, fused=True)
     for iteration in range(ppo.iterations):
-        seeds: list[int] = []
-        generators = []
-        for training in trainings.values():
-            draws = np.random.SeedSequence([training.seed, iteration]).generate_state(ppo.envs + 1, np.uint64).tolist()
-            generators.append(torch.Generator().manual_seed(draws.pop() >> 1))
-            seeds += draws
+        drawn = [random_numbers(training.seed, iteration, ppo.envs) for training in trainings.values()]
+        seeds, generators = [seed for seeds, _ in drawn for seed in seeds], [generator for _, generator in drawn]
         optimiser.param_groups[0]["lr"] = ppo.learning_rate * (1.0 - iteration / ppo.iterations)
         noise = [exploration_noise(ppo.rollout, ppo.envs, ppo.noise_memory, generator) for generator in generators]
         rollout = collect(env, actors.exploring(ppo.envs), torch.cat(noise, 1), seeds)
@@ -202,7 +194,7 @@ def improve(
             seen, actions, states, rest = torch.split(some, widths, 2)
             before, advantage, value = rest.unbind(2)
             noise = (actions - actors.means(seen)) / actors.log_deviations.exp()
-            policy_loss = surrogate(_log_density(noise, actors.log_deviations) - before, advantage, ppo.clip)
+            policy_loss = surrogate(log_density(noise, actors.log_deviations) - before, advantage, ppo.clip)
             value_loss = 0.5 * (critic(states).squeeze(2) - value).square().mean()
             optimiser.zero_grad()
             torch.autograd.backward(count * (policy_loss + value_loss) - ppo.entropy * actors.log_deviations.sum())

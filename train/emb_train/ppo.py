@@ -201,12 +201,17 @@ class Actor(nn.Module):
 
     def log_density_of(self, noise: Tensor) -> Tensor:
         """Log π(a | o) of actions this many standard deviations from their means, shape [..., 1] to [...]."""
-        density: Tensor = -0.5 * noise.square() - self.log_deviation - 0.5 * math.log(2.0 * math.pi)
-        return density.squeeze(-1)
+        return log_density(noise, self.log_deviation)
 
     def entropy(self) -> Tensor:
         """Of the policy, the same for every observation."""
         return self.log_deviation.sum() + 0.5 * math.log(2.0 * math.pi * math.e)
+
+
+def log_density(noise: Tensor, log_deviation: Tensor) -> Tensor:
+    """Log density of Gaussian actions this many standard deviations from their means, shape [..., 1] to [...]."""
+    density: Tensor = -0.5 * noise.square() - log_deviation - 0.5 * math.log(2.0 * math.pi)
+    return density.squeeze(-1)
 
 
 class Critic(nn.Module):
@@ -370,14 +375,13 @@ def train(envs: Sequence[EmbExcitationVectorEnv], actor: Actor, ppo: Ppo, seed: 
     optimiser = torch.optim.Adam(learned, eps=1e-5, fused=True)
     early = 0
     for iteration in range(ppo.iterations):
-        draws = np.random.SeedSequence([seed, iteration]).generate_state(ppo.envs + 1, np.uint64).tolist()
-        generator = torch.Generator().manual_seed(draws.pop() >> 1)
+        seeds, generator = random_numbers(seed, iteration, ppo.envs)
         remaining = 1.0 - iteration / ppo.iterations
         optimiser.param_groups[0]["lr"] = ppo.learning_rate * remaining
         if ppo.final_deviation is not None:
             deviation = ppo.final_deviation + remaining * (ppo.initial_deviation - ppo.final_deviation)
             actor.log_deviation.fill_(math.log(deviation))
-        rollout = collect_all(envs, actor, ppo, draws, generator)
+        rollout = collect_all(envs, actor, ppo, seeds, generator)
         losses = improve(actor, critic, optimiser, rollout, ppo, generator)
         if not all(torch.isfinite(w).all() for network in (actor, critic) for w in network.parameters()):
             raise TrainingDivergedError(
@@ -401,6 +405,12 @@ def train(envs: Sequence[EmbExcitationVectorEnv], actor: Actor, ppo: Ppo, seed: 
             **losses,
             deviation=float(actor.log_deviation.detach().exp()),
         )
+
+
+def random_numbers(seed: int, iteration: int, envs: int) -> tuple[list[int], torch.Generator]:
+    """All randomness of an iteration of a training: seeds of its experiments, generator of its noise and orders."""
+    *seeds, own = np.random.SeedSequence([seed, iteration]).generate_state(envs + 1, np.uint64).tolist()
+    return seeds, torch.Generator().manual_seed(own >> 1)
 
 
 def collect_all(
